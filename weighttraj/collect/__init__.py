@@ -1,0 +1,24 @@
+"""From a training run to a stored trajectory. Needs the extra ``sb3``."""
+
+from weighttraj.errors import missing_extra
+
+try:
+    import stable_baselines3 as _sb3
+except ModuleNotFoundError as error:
+    raise missing_extra(str(error.name), "sb3") from error
+
+from weighttraj.collect.callback import WeightTrajectoryCallback
+from weighttraj.collect.ppo import PPOConfig, make_ppo
+from weighttraj.collect.recipe import Recipe, read_recipe
+from weighttraj.collect.runner import collect
+
+__all__ = [
+    "PPOConfig",
+    "Recipe",
+    "WeightTrajectoryCallback",
+    "collect",
+    "make_ppo",
+    "read_recipe",
+]
+
+del _sb3

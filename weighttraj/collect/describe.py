@@ -1,0 +1,167 @@
+"""What a Stable-Baselines3 model is, as the metadata of a run says it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from torch import nn
+
+from weighttraj.format import Algorithm, Cadence, Provenance
+from weighttraj.format.layout import Role
+
+PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy", "zarr", "weighttraj")
+
+DIAGNOSTICS = {
+    "PPO": (
+        "approx_kl",
+        "clip_fraction",
+        "entropy_loss",
+        "explained_variance",
+        "policy_gradient_loss",
+        "value_loss",
+    ),
+    "A2C": ("entropy_loss", "explained_variance", "policy_loss", "value_loss"),
+}
+"""What each algorithm logs under ``train/`` after an update."""
+
+HYPERPARAMETERS = (
+    "n_steps",
+    "batch_size",
+    "n_epochs",
+    "n_envs",
+    "gamma",
+    "gae_lambda",
+    "ent_coef",
+    "vf_coef",
+    "max_grad_norm",
+    "normalize_advantage",
+    "target_kl",
+    "use_sde",
+)
+"""Attributes of a model that are hyper-parameters with plain values."""
+
+_ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.ELU: "elu", nn.LeakyReLU: "leaky_relu"}
+_CRITIC = ("value_net.", "mlp_extractor.value_net.", "vf_features_extractor.")
+
+
+def check_model(model: BaseAlgorithm) -> OnPolicyAlgorithm:
+    """The model, if its weights can be collected.
+
+    Raises:
+        CollectError: it is no on-policy algorithm with one optimizer.
+    """
+    values = {n: _plain(getattr(model, n)) for n in HYPERPARAMETERS if hasattr(model, n)}
+    for name in ("lr_schedule", "clip_range", "clip_range_vf"):
+        schedule = getattr(model, name, None)
+        if callable(schedule):
+            values[name] = [[p, float(schedule(p))] for p in (1.0, 0.75, 0.5, 0.25, 0.0)]
+    values["policy_kwargs"] = _plain(model.policy_kwargs)
+    values["optimizer"] = {
+        "class": type(model.policy.optimizer).__name__,
+        **_plain({k: v for k, v in model.policy.optimizer.defaults.items() if v is not None}),
+    }
+    version = importlib.metadata.version("stable-baselines3")
+    return Algorithm(
+        name=type(model).__name__, library=f"stable-baselines3 {version}", hyperparameters=values
+    )
+
+
+def describe_cadence(model: OnPolicyAlgorithm, every: int) -> Cadence:
+    """When snapshots are taken."""
+    steps: int | None = 1
+    if hasattr(model, "n_epochs"):
+        batch_size: int = getattr(model, "batch_size")  # noqa: B009
+        minibatches = -(-model.n_steps * model.n_envs // batch_size)
+        steps = model.n_epochs * minibatches if getattr(model, "target_kl", None) is None else None
+    return Cadence(every=every, gradient_steps_per_iteration=steps)
+
+
+def describe_provenance() -> Provenance:
+    """Versions, machine and command of this process."""
+    packages = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return Provenance(
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        packages=packages,
+        platform=f"{platform.system()} {platform.machine()}",
+        cpu=_cpu(),
+        threads=torch.get_num_threads(),
+        command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        commit=_commit(),
+    )
+
+
+def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, list[str]]:
+    """Layer names, activation, and reasons why this is no plain MLP."""
+    reasons = []
+    if not isinstance(policy.features_extractor, FlattenExtractor):
+        reasons.append(f"features from {type(policy.features_extractor).__name__}")
+    if any(True for _ in policy.buffers()):
+        reasons.append("buffers beside the parameters, which are not stored")
+    net = getattr(getattr(policy, "mlp_extractor", None), "policy_net", None)
+    if not isinstance(net, nn.Sequential) or not isinstance(policy.action_net, nn.Linear):
+        return (), "", [*reasons, f"policy class {type(policy).__name__} with no policy_net"]
+    linear = [i for i, module in enumerate(net) if isinstance(module, nn.Linear)]
+    kinds = {type(m) for m in net if not isinstance(m, nn.Linear)}
+    known = kinds & _ACTIVATIONS.keys()
+    if kinds != known or len(kinds) > 1 or len(net) != 2 * len(linear):
+        names = sorted(kind.__name__ for kind in kinds)
+        reasons.append(f"hidden modules {names}, not one activation after each linear layer")
+    activation = next((_ACTIVATIONS[kind] for kind in known), "")
+    prefixes = [f"mlp_extractor.policy_net.{i}" for i in linear] + ["action_net"]
+    return tuple((f"{p}.weight", f"{p}.bias") for p in prefixes), activation, reasons
+
+
+def _role(name: str) -> Role:
+    if name == "log_std":
+        return "log_std"
+    ending = name.rsplit(".", 1)[-1]
+    return "weight" if ending == "weight" else "bias" if ending == "bias" else "other"
+
+
+def _plain(value: Any) -> Any:
+    """The nearest JSON value: code is named, never stored."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return getattr(value, "__qualname__", type(value).__qualname__)
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((s.split(":", 1)[1].strip() for s in lines if s.startswith("model name")), "")
+
+
+def _commit() -> str:
+    try:
+        command = ["git", "rev-parse", "HEAD"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)  # noqa: S603
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

@@ -1,0 +1,199 @@
+"""Finds the normalisers of a training environment and reads their statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import wrappers as gw
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+)
+
+from weighttraj.collect.wrappers import ClipObservation, TruncationAsTermination
+from weighttraj.errors import CollectError
+from weighttraj.format.schema import ObsNorm
+
+Moments = tuple[np.ndarray, np.ndarray, float]
+
+# Wrappers that leave observations alone and do not change what an action means: SB3 clips
+# actions to the space's bounds anyway. Those that touch only rewards count as such.
+_HARMLESS: tuple[type, ...] = (
+    gw.TimeLimit,
+    gw.OrderEnforcing,
+    gw.PassiveEnvChecker,
+    gw.RecordEpisodeStatistics,
+    gw.RecordVideo,
+    gw.ClipAction,
+    gw.NormalizeReward,
+    gw.TransformReward,
+    Monitor,
+    TruncationAsTermination,
+)
+_HARMLESS_VEC: tuple[type, ...] = (VecMonitor, VecCheckNan)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Normalizers:
+    """Where the statistics of a training environment are."""
+
+    obs_norm: ObsNorm | None
+    """What is fixed about the observation normaliser; None: there is none."""
+    read_obs: Callable[[], Moments] | None
+    """Copies its statistics."""
+    read_ret: Callable[[], Moments] | None
+    """Copies the reward normaliser's statistics; None: there is none."""
+    wrappers: tuple[str, ...]
+    """Class names of all wrappers, outermost first."""
+    unknown: tuple[str, ...]
+    """Wrappers that change observations or actions in a way that cannot be recorded."""
+
+
+def find_normalizers(env: VecEnv) -> Normalizers:
+    """Look through the wrappers of a vectorised environment.
+
+    Raises:
+        CollectError: several environments have a normaliser each, or normalisers are stacked.
+    """
+    vec_wrappers, base = _unwrap(env, VecEnvWrapper, "venv")
+    vec_normalize = [w for w in vec_wrappers if isinstance(w, VecNormalize)]
+    known_vec = (*_HARMLESS_VEC, VecNormalize)
+    unknown = [type(w).__name__ for w in vec_wrappers if not isinstance(w, known_vec)]
+    chain, obs_sources, ret_sources = _inner_wrappers(base)
+    unknown += [type(w).__name__ for i, w in enumerate(chain) if not _is_known(w, chain[i + 1 :])]
+
+    sources = [_gymnasium_obs(chain, w) for w in obs_sources]
+    sources += [_vec_obs(w) for w in vec_normalize if w.norm_obs and _has_array_stats(w)]
+    unknown += ["VecNormalize of a Dict" for w in vec_normalize if not _has_array_stats(w)]
+    if len(sources) > 1:
+        raise CollectError(
+            "several observation normalisers, one on top of the other",
+            expected="at most one",
+            got=[spec.source for spec, _ in sources],
+            do="use either gymnasium's NormalizeObservation or SB3's VecNormalize",
+        )
+    obs_norm, read_obs = sources[0] if sources else (None, None)
+    ret_stats: list[Any] = [w.ret_rms for w in vec_normalize if w.norm_reward]
+    ret_stats += [w.return_rms for w in ret_sources]
+    return Normalizers(
+        obs_norm=obs_norm,
+        read_obs=read_obs,
+        read_ret=(lambda: _copy(ret_stats[0])) if ret_stats else None,
+        wrappers=tuple(type(w).__name__ for w in (*vec_wrappers, base, *chain)),
+        unknown=tuple(unknown),
+    )
+
+
+def _inner_wrappers(base: VecEnv) -> tuple[list[Any], list[Any], list[Any]]:
+    """Wrappers of one inner environment, and the normalisers among them."""
+    if not isinstance(base, DummyVecEnv):
+        if any(base.env_is_wrapped(gw.NormalizeObservation)):
+            raise CollectError(
+                "the observation normalisers live in other processes",
+                expected="DummyVecEnv, or VecNormalize around the vectorised environment",
+                got=f"{type(base).__name__} around gymnasium's NormalizeObservation",
+                do="normalise with VecNormalize instead",
+            )
+        return [], [], []
+    chains = [_unwrap(env, gym.Wrapper, "env")[0] for env in base.envs]
+    obs = [w for w in chains[0] if isinstance(w, gw.NormalizeObservation)]
+    if obs and len(chains) > 1:
+        raise CollectError(
+            "each environment has an observation normaliser of its own, so no single policy "
+            "acts in all of them",
+            expected="one environment, or one normaliser for all",
+            got=f"{len(chains)} environments",
+            do="train with n_envs=1, or normalise with VecNormalize",
+        )
+    ret = [w for w in chains[0] if isinstance(w, gw.NormalizeReward)] if len(chains) == 1 else []
+    return chains[0], obs, ret
+
+
+def _unwrap(env: Any, kind: type, attribute: str) -> tuple[list[Any], Any]:
+    chain = []
+    while isinstance(env, kind):
+        chain.append(env)
+        env = getattr(env, attribute)
+    return chain, env
+
+
+def _is_known(wrapper: Any, inside: list[Any]) -> bool:
+    if _clip_bounds(wrapper) is not None:
+        # Recorded as the normaliser's clip, so there must be a normaliser inside.
+        return any(isinstance(w, gw.NormalizeObservation) for w in inside)
+    if isinstance(wrapper, gw.FlattenObservation):
+        return len(wrapper.env.observation_space.shape or ()) == 1
+    return isinstance(wrapper, (*_HARMLESS, gw.NormalizeObservation))
+
+
+def _has_array_stats(wrapper: VecNormalize) -> bool:
+    return not wrapper.norm_obs or not isinstance(wrapper.obs_rms, dict)
+
+
+def _vec_obs(wrapper: VecNormalize) -> tuple[ObsNorm, Callable[[], Moments]]:
+    spec = ObsNorm(
+        source="stable_baselines3.VecNormalize",
+        epsilon=wrapper.epsilon,
+        shape=tuple(wrapper.observation_space.shape or ()),
+        clip_low=-wrapper.clip_obs,
+        clip_high=wrapper.clip_obs,
+        cast_before_clip=False,
+    )
+    return spec, lambda: _copy(wrapper.obs_rms)
+
+
+def _gymnasium_obs(
+    chain: list[Any], wrapper: gw.NormalizeObservation[Any, Any, Any]
+) -> tuple[ObsNorm, Callable[[], Moments]]:
+    outside = chain[: chain.index(wrapper)]
+    bounds = [b for w in outside if (b := _clip_bounds(w)) is not None]
+    low, high = (
+        (None, None) if not bounds else (max(b[0] for b in bounds), min(b[1] for b in bounds))
+    )
+    # Gymnasium keeps float32 statistics until the first float64 observation arrives.
+    inner = wrapper.env.observation_space.dtype
+    kept_in_32 = inner is not None and inner.kind == "f" and inner.itemsize <= 4
+    spec = ObsNorm(
+        source="gymnasium.NormalizeObservation",
+        epsilon=wrapper.epsilon,
+        shape=tuple(wrapper.obs_rms.mean.shape),
+        clip_low=low,
+        clip_high=high,
+        dtype="float32" if kept_in_32 else "float64",
+    )
+    return spec, lambda: _copy(wrapper.obs_rms)
+
+
+def _clip_bounds(wrapper: Any) -> tuple[float, float] | None:
+    """Bounds of a wrapper that clips observations; None: it does something else.
+
+    CleanRL clips by a lambda. It cannot be read, but it can be asked.
+    """
+    if isinstance(wrapper, ClipObservation):
+        return wrapper.low, wrapper.high
+    if not isinstance(wrapper, gw.TransformObservation):
+        return None
+    shape = wrapper.env.observation_space.shape or ()
+    probes = np.random.default_rng(0).normal(size=(64, *shape)).astype(np.float32)
+    probes *= np.logspace(-30, 30, 64, dtype=np.float32).reshape(-1, *(1 for _ in shape))
+    try:
+        answers = np.stack([np.asarray(wrapper.func(p.copy())) for p in probes])
+    except Exception:
+        return None
+    low, high = float(answers.min()), float(answers.max())
+    clips = answers.shape == probes.shape and np.array_equal(answers, probes.clip(low, high))
+    return (low, high) if clips and max(-low, high) < 1e20 else None
+
+
+def _copy(stats: Any) -> Moments:
+    mean, var = (np.array(x, np.float64) for x in (stats.mean, stats.var))
+    return mean, var, float(stats.count)

@@ -1,0 +1,151 @@
+"""A recipe: everything that a data set is made from, in one TOML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from weighttraj.collect.ppo import PPOConfig
+from weighttraj.errors import RecipeError
+
+SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeds:
+    """Seeds of each split. A range is written ``"0:30"``, the end excluded."""
+
+    train: list[int] | str = field(default_factory=list)
+    """Runs that models are trained on."""
+    validation: list[int] | str = field(default_factory=list)
+    """Runs that choices are made on."""
+    test: list[int] | str = field(default_factory=list)
+    """Runs that only results are computed on."""
+
+    def by_split(self) -> dict[str, list[int]]:
+        """The seeds of each split, ranges written out."""
+        return {name: parse_seeds(getattr(self, name)) for name in SPLITS}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Store:
+    """What is stored, and how often."""
+
+    every: int = 64
+    """Gradient steps from one snapshot to the next."""
+    critic: bool = False
+    """Store the critic's parameters."""
+    optimizer_moments: bool = False
+    """Store Adam's moments of the policy's parameters."""
+    probe_observations: int = 64
+    """Network inputs kept of each rollout."""
+    block: int = 64
+    """Snapshots in a chunk and in a commit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Everything that a data set is made from."""
+
+    id: str
+    """Id of the data set, ``<env>-<algorithm>-v<N>``."""
+    version: str = "1"
+    """Version of the data."""
+    licence: str = "CC-BY-4.0"
+    """Licence of the data."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """Environment, network and PPO."""
+    seeds: Seeds = field(default_factory=Seeds)
+    """Seeds, by split."""
+    store: Store = field(default_factory=Store)
+    """What is stored."""
+
+    def splits(self) -> dict[int, str]:
+        """The split of each seed.
+
+        Raises:
+            RecipeError: a seed is in two splits.
+        """
+        found: dict[int, str] = {}
+        for split, seeds in self.seeds.by_split().items():
+            for seed in seeds:
+                if seed in found:
+                    raise RecipeError(
+                        "a seed is named twice",
+                        expected="each seed once, in one split",
+                        got=f"seed {seed} in {found[seed]} and in {split}",
+                        where=f"[seeds] of recipe {self.id!r}",
+                        do="remove one; a run that is trained on cannot be tested on",
+                    )
+                found[seed] = split
+        return found
+
+
+def read_recipe(path: str | Path) -> Recipe:
+    """Read a recipe.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        RecipeError: it is no TOML, has unknown keys, or values of the wrong type.
+    """
+    path = Path(path)
+    try:
+        document = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecipeError("the recipe is no TOML", got=error, where=path) from error
+    _check_keys(document, Recipe, str(path))
+    try:
+        recipe = msgspec.convert(document, Recipe)
+    except msgspec.ValidationError as error:
+        raise RecipeError(
+            "the recipe has a value of the wrong type", got=error, where=path
+        ) from error
+    recipe.splits()
+    return recipe
+
+
+def parse_seeds(seeds: list[int] | str) -> list[int]:
+    """Seeds from a list or a range.
+
+    >>> parse_seeds("3:6")
+    [3, 4, 5]
+
+    Raises:
+        RecipeError: it is no such range, or a seed is negative.
+    """
+    try:
+        if isinstance(seeds, str):
+            start, _, stop = seeds.partition(":")
+            seeds = list(range(int(start), int(stop or int(start) + 1)))
+        if min(seeds, default=0) < 0:
+            raise ValueError
+    except ValueError as error:
+        raise RecipeError(
+            "these are no seeds",
+            expected='a list of integers from 0, or a range such as "0:30" (the end excluded)',
+            got=repr(seeds),
+        ) from error
+    return seeds
+
+
+def _check_keys(table: dict[str, Any], kind: type, where: str) -> None:
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    for key, value in table.items():
+        if key not in fields:
+            near = difflib.get_close_matches(key, fields, n=1)
+            raise RecipeError(
+                "the recipe has a key that nothing reads",
+                expected=sorted(fields),
+                got=repr(key),
+                where=where,
+                do=f"did you mean {near[0]!r}?" if near else "remove it",
+            )
+        part: Any = fields[key].default_factory
+        if isinstance(value, dict) and part in (PPOConfig, Seeds, Store):
+            _check_keys(value, part, f"{where}, [{key}]")

@@ -1,0 +1,285 @@
+"""From a recipe to a data set: one process a run, and on again where it stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import queue
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import msgspec
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from stable_baselines3.common.callbacks import BaseCallback
+
+from weighttraj.collect.callback import WeightTrajectoryCallback
+from weighttraj.collect.ppo import make_ppo
+from weighttraj.collect.recipe import Recipe
+from weighttraj.errors import CollectError, ReplayError, WeightTrajError
+from weighttraj.format import Dataset, DatasetInfo, RunEntry, open_dataset
+from weighttraj.format.reader import read_dataset_info
+from weighttraj.format.schema import to_json
+from weighttraj.format.storage import read_info, replace_file
+
+Report = Callable[[int, int], None]
+"""Called with a seed and its environment steps so far."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One run to be made: idempotent, so that it may be done again after a failure."""
+
+    recipe: Recipe
+    seed: int
+    path: Path
+
+
+def collect(
+    recipe: Recipe,
+    out: str | Path,
+    *,
+    seeds: list[int] | None = None,
+    workers: int = 1,
+    console: Console | None = None,
+) -> Dataset:
+    """Collect the runs of a recipe that do not exist yet.
+
+    Complete runs are left alone. An interrupted run is repeated from its seed: as long as it
+    repeats its committed snapshots it is continued after the last of them; if it does not (another
+    machine, other versions), it starts over under a new id and the old one stays on disk.
+
+    Args:
+        recipe: what to collect.
+        out: folder of the data set.
+        seeds: only these; seeds that the recipe does not name belong to no split.
+        workers: processes; 1 means this one.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        CollectError: the folder holds another data set, or a run failed.
+        RecipeError: the recipe contradicts itself.
+    """
+    out = Path(out)
+    console = console or Console(quiet=True)
+    info = _prepare(recipe, out, seeds)
+    wanted = set(recipe.splits() if seeds is None else seeds)
+    tasks = []
+    for entry in info.runs:
+        if entry.seed not in wanted:
+            continue
+        state = _state(out / entry.path)
+        console.print(f"seed {entry.seed}: {state}")
+        if not state.startswith("complete"):
+            tasks.append(Task(recipe=recipe, seed=entry.seed, path=out / entry.path))
+    failures = _run(tasks, workers, console)
+    again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
+    failures = [f for f in failures if not isinstance(f[1], ReplayError)]
+    failures += _run(again, workers, console)
+    if failures:
+        raise CollectError(
+            f"{len(failures)} of {len(tasks)} runs failed; the others are whole",
+            got="\n".join(f"seed {task.seed}: {error}" for task, error in failures),
+            where=out,
+            do="mend the cause and give the same command again: it goes on where it stopped",
+        )
+    _write_info(out, _with_status(out, read_dataset_info(out)))
+    return open_dataset(out)
+
+
+def collect_run(task: Task, report: Report) -> None:
+    """Collect one run in this process, with one thread: the thread count moves the bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    store, config = task.recipe.store, task.recipe.ppo
+    callback = WeightTrajectoryCallback(
+        task.path,
+        every=store.every,
+        critic=store.critic,
+        optimizer_moments=store.optimizer_moments,
+        probe_observations=store.probe_observations,
+        block=store.block,
+        resume=True,
+    )
+    try:
+        model = make_ppo(config, seed=task.seed)
+        progress = _ProgressCallback(task.seed, report)
+        model.learn(config.n_iterations * config.n_steps, callback=[callback, progress])
+    finally:
+        callback.close()
+        torch.set_num_threads(threads)
+
+
+class _ProgressCallback(BaseCallback):
+    def __init__(self, seed: int, report: Report) -> None:
+        super().__init__()
+        self._seed, self._report = seed, report
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._report(self._seed, self.num_timesteps)
+
+
+def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
+    """Write ``dataset.json`` with every run that will be there."""
+    document = msgspec.to_builtins(recipe) | {"seeds": recipe.seeds.by_split()}
+    info = DatasetInfo(
+        id=recipe.id, version=recipe.version, licence=recipe.licence, recipe=document
+    )
+    if (out / "dataset.json").exists():
+        old = read_dataset_info(out)
+        if {**old.recipe, "seeds": None} != {**document, "seeds": None}:
+            raise CollectError(
+                "the folder holds a data set of another recipe",
+                expected=old.recipe,
+                got=document,
+                where=out,
+                do="choose another folder with --out",
+            )
+        info = replace(old, recipe=document)
+    elif out.exists() and any(out.iterdir()):
+        raise CollectError(
+            "the folder is not empty and holds no data set",
+            expected="a new or empty folder, or one with dataset.json",
+            got=sorted(p.name for p in out.iterdir())[:5],
+            where=out,
+            do="choose another folder with --out",
+        )
+    splits = recipe.splits()
+    known = {run.seed: run for run in info.runs}
+    for seed in sorted({*splits, *(seeds or ())}):
+        if seed not in known:
+            name = f"seed{seed:04d}"
+            known[seed] = RunEntry(id=name, path=f"runs/{name}.zarr", seed=seed)
+        split = cast(Literal["train", "validation", "test", ""], splits.get(seed, ""))
+        known[seed] = replace(known[seed], split=split)
+    info = replace(info, status="collecting", runs=tuple(known.values()))
+    out.mkdir(parents=True, exist_ok=True)
+    _write_info(out, info)
+    return info
+
+
+def _run(tasks: list[Task], workers: int, console: Console) -> list[tuple[Task, Exception]]:
+    """Do the tasks; return those that failed."""
+    if not tasks:
+        return []
+    failures: list[tuple[Task, Exception]] = []
+    with _progress(tasks, console) as report:
+        if workers == 1:
+            for task in tasks:
+                try:
+                    collect_run(task, report)
+                except (WeightTrajError, OSError, RuntimeError) as error:
+                    failures.append((task, error))
+        else:
+            failures += _run_in_processes(tasks, workers, report)
+    return failures
+
+
+def _run_in_processes(
+    tasks: list[Task], workers: int, report: Report
+) -> list[tuple[Task, Exception]]:
+    context = multiprocessing.get_context("spawn")
+    failures: list[tuple[Task, Exception]] = []
+    with (
+        context.Manager() as manager,
+        ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context) as pool,
+    ):
+        steps = manager.Queue()
+        futures: dict[Future[None], Task] = {
+            pool.submit(collect_run, task, steps_reporter(steps)): task for task in tasks
+        }
+        while not all(future.done() for future in futures) or not steps.empty():
+            with contextlib.suppress(queue.Empty):
+                report(*steps.get(timeout=0.2))
+        for future, task in futures.items():
+            error = future.exception()
+            if isinstance(error, BrokenProcessPool):
+                error = CollectError("its process was killed", do="is there enough memory?")
+            if isinstance(error, Exception):
+                failures.append((task, error))
+    return failures
+
+
+def steps_reporter(steps: Any) -> Report:
+    """A picklable function that puts progress into a queue."""
+    return _QueueReporter(steps)
+
+
+class _QueueReporter:
+    def __init__(self, steps: Any) -> None:
+        self._steps = steps
+
+    def __call__(self, seed: int, num_timesteps: int) -> None:
+        self._steps.put((seed, num_timesteps))
+
+
+@contextlib.contextmanager
+def _progress(tasks: list[Task], console: Console) -> Iterator[Report]:
+    """One bar a run."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("environment steps,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Progress(*columns, console=console) as progress:
+        config = tasks[0].recipe.ppo
+        total = config.n_iterations * config.n_steps
+        bars = {t.seed: progress.add_task(f"seed {t.seed}", total=total) for t in tasks}
+        yield lambda seed, steps: progress.update(bars[seed], completed=steps)
+
+
+def _state(path: Path) -> str:
+    if not path.exists():
+        return "to be collected"
+    info = read_info(path)
+    if info.status == "complete":
+        return f"complete, {info.n_committed} snapshots"
+    return (
+        f"interrupted after {info.n_committed} committed snapshots: repeating the seed, "
+        "comparing them, continuing after the last"
+    )
+
+
+def _mismatches(failures: list[tuple[Task, Exception]]) -> list[tuple[Task, ReplayError]]:
+    return [(task, error) for task, error in failures if isinstance(error, ReplayError)]
+
+
+def _start_over(out: Path, task: Task, error: ReplayError, console: Console) -> Task:
+    """Give a run that could not be continued a new id in the data set."""
+    info = read_dataset_info(out)
+    old = next(run for run in info.runs if run.seed == task.seed)
+    n = 2
+    while (out / f"runs/seed{task.seed:04d}-{n}.zarr").exists():
+        n += 1
+    name = f"seed{task.seed:04d}-{n}"
+    new = replace(old, id=name, path=f"runs/{name}.zarr")
+    _write_info(out, replace(info, runs=tuple(new if r is old else r for r in info.runs)))
+    console.print(
+        f"seed {task.seed}: {error}\n"
+        f"seed {task.seed}: starting over as {name}; what it had committed stays in {old.path}"
+    )
+    return replace(task, path=out / new.path)
+
+
+def _with_status(out: Path, info: DatasetInfo) -> DatasetInfo:
+    done = all(
+        (out / run.path).exists() and _state(out / run.path).startswith("complete")
+        for run in info.runs
+    )
+    return replace(info, status="complete" if done else "collecting")
+
+
+def _write_info(out: Path, info: DatasetInfo) -> None:
+    replace_file(out / "dataset.json", json.dumps(to_json(info), indent=1).encode())

@@ -1,0 +1,93 @@
+"""One family of errors. Each says what is wrong: expected, got, where, and what to do."""
+
+from __future__ import annotations
+
+
+class WeightTrajError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        expected: object = None,
+        got: object = None,
+        where: object = None,
+        do: str | None = None,
+    ) -> None:
+        lines = [what]
+        for label, value in (
+            ("expected", expected),
+            ("got", got),
+            ("where", where),
+            ("what to do", do),
+        ):
+            if value is not None:
+                lines.append(f"  {label}: {value}")
+        self.message = "\n".join(lines)
+        super().__init__(self.message)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Survive the trip from a worker process, where only positional arguments are replayed."""
+        return (_rebuild, (type(self), self.message))
+
+
+def _rebuild(kind: type[WeightTrajError], message: str) -> WeightTrajError:
+    return kind(message)
+
+
+class FormatError(WeightTrajError, ValueError):
+    """What lies on disk, or is about to, does not follow the format."""
+
+
+class NewerFormatError(FormatError):
+    """A store was written by a later version of the format than this reader knows."""
+
+
+class DamageError(FormatError):
+    """Committed data is missing or its checksum is wrong."""
+
+
+class StoreExistsError(WeightTrajError, FileExistsError):
+    """The path to be written exists."""
+
+
+class StoreLockedError(WeightTrajError, RuntimeError):
+    """Another process is writing this run."""
+
+
+class SnapshotError(WeightTrajError, ValueError):
+    """A snapshot that cannot be stored: wrong shape, or values that are not finite."""
+
+
+class ReplayError(WeightTrajError, RuntimeError):
+    """A run that was to be continued did not repeat its committed snapshots."""
+
+
+class CollectError(WeightTrajError, ValueError):
+    """A training set-up that cannot be collected."""
+
+
+class RecipeError(WeightTrajError, ValueError):
+    """A recipe that cannot be followed."""
+
+
+class PolicyError(WeightTrajError, ValueError):
+    """A stored policy that cannot be rebuilt or run."""
+
+
+class WindowError(WeightTrajError, ValueError):
+    """Windows that the stored runs cannot give."""
+
+
+class MissingExtraError(WeightTrajError, ImportError):
+    """An optional dependency is not installed."""
+
+
+def missing_extra(module: str, extra: str) -> MissingExtraError:
+    """The error for an optional dependency that is not installed, with the command that helps."""
+    return MissingExtraError(
+        f"this part of the package needs {module}, which is not installed",
+        where=f"optional dependencies [{extra}]",
+        do=f"pip install 'weighttraj[{extra}]'",
+    )

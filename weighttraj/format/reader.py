@@ -1,0 +1,314 @@
+"""Reads data sets and runs. Only committed snapshots are seen."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from weighttraj.errors import DamageError, FormatError
+from weighttraj.format.layout import ParamLayout
+from weighttraj.format.schema import ArraySpec, DatasetInfo, RunEntry, RunInfo, parse_json
+from weighttraj.format.storage import RunStore
+
+if TYPE_CHECKING:
+    from weighttraj.load.windows import WindowDataset
+    from weighttraj.policies.policy import Policy
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormStats:
+    """Statistics of a normaliser at one time."""
+
+    mean: np.ndarray
+    """float64, shape of an observation; () for rewards."""
+    var: np.ndarray
+    """float64, shape of an observation; () for rewards."""
+    count: float
+    """Samples so far; trainers start it slightly above 0."""
+
+
+class StoredArray:
+    """One array of a run, read when it is indexed. Rows are the committed ones.
+
+    Slices and integers are read as numpy would; rows of ``policy/weights`` read whole are also
+    compared with the digests of their snapshots.
+    """
+
+    def __init__(self, store: RunStore, spec: ArraySpec) -> None:
+        self._store = store
+        self._spec = spec
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Committed rows and the shape of a row."""
+        return (self._store.info.committed(self._spec.axis), *self._spec.inner)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Element type."""
+        return np.dtype(self._spec.dtype)
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Names of the dimensions."""
+        return self._spec.dims
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Read rows (and, after a comma, columns).
+
+        Raises:
+            IndexError: outside the committed rows.
+            DamageError: a chunk is missing or damaged, or a digest does not match.
+        """
+        rows, *rest = key if isinstance(key, tuple) else (key,)
+        index = _rows(rows, len(self), f"{self._store.path}, array {self._spec.name!r}")
+        values = self._store.read(self._spec.name, (index, *rest) if rest else index)
+        if self._spec.name == "policy/weights" and not rest:
+            self._check(index, values)
+        return values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
+
+    def __repr__(self) -> str:
+        return f"<{self._spec.name} {self.dtype} {dict(zip(self.dims, self.shape, strict=True))}>"
+
+    def _check(self, index: Any, values: np.ndarray) -> None:
+        digests = np.atleast_2d(self._store.read("digest", index))
+        for i, row in enumerate(np.atleast_2d(values)):
+            if hashlib.sha256(row.astype("<f4").tobytes()).digest() != digests[i].tobytes():
+                raise DamageError(
+                    "a snapshot does not match its digest",
+                    expected=digests[i].tobytes().hex(),
+                    got=hashlib.sha256(row.astype("<f4").tobytes()).hexdigest(),
+                    where=f"{self._store.path}, row {i} of the rows read",
+                    do="restore the run's files from a copy, or collect the run again",
+                )
+
+
+class Run:
+    """One training run: its trajectory of weights and what belongs to each snapshot."""
+
+    def __init__(self, path: str | Path, split: str = "") -> None:
+        self.path = Path(path)
+        self.split = split
+        """Part of the data set: train, validation, test, or empty."""
+        self._store = RunStore.open(self.path)
+
+    @property
+    def info(self) -> RunInfo:
+        """Metadata."""
+        return self._store.info
+
+    @property
+    def id(self) -> str:
+        """Id, unique in the data set."""
+        return self.info.run_id
+
+    @property
+    def layout(self) -> ParamLayout:
+        """Order of the parameters in a snapshot."""
+        return self.info.layout
+
+    @property
+    def weights(self) -> StoredArray:
+        """Policy weights, float32 (time, param)."""
+        return self["policy/weights"]
+
+    @property
+    def num_timesteps(self) -> Int64[np.ndarray, " time"]:
+        """Environment steps at each snapshot."""
+        return self["index/num_timesteps"][:]
+
+    @property
+    def iteration(self) -> Int64[np.ndarray, " time"]:
+        """Iteration of each snapshot: 0 before training, then from 1."""
+        return self["index/iteration"][:]
+
+    @property
+    def phase(self) -> Int64[np.ndarray, " time"]:
+        """Which part of its iteration ends at each snapshot, from 0; -1 before training."""
+        return self["index/phase"][:]
+
+    @property
+    def learning_rate(self) -> Float64[np.ndarray, " time"]:
+        """Learning rate of the gradient step that led to each snapshot."""
+        return self["index/learning_rate"][:]
+
+    @property
+    def arrays(self) -> dict[str, StoredArray]:
+        """All arrays, by name."""
+        return {name: StoredArray(self._store, spec) for name, spec in self._store.specs.items()}
+
+    def __getitem__(self, name: str) -> StoredArray:
+        """Any array by name, such as ``train/approx_kl``; ``run.arrays`` lists them."""
+        try:
+            return StoredArray(self._store, self._store.specs[name])
+        except KeyError:
+            names = ", ".join(self._store.specs)
+            raise KeyError(f"run {self.id} stores no {name!r}; it stores {names}") from None
+
+    def __len__(self) -> int:
+        """Number of committed snapshots."""
+        return self.info.n_committed
+
+    def obs_norm(self, t: int) -> NormStats | None:
+        """Statistics of the observation normaliser at snapshot t; None: the run has none."""
+        return self._stats("obs_norm", t) if self.info.obs_norm is not None else None
+
+    def ret_norm(self, t: int) -> NormStats | None:
+        """Statistics of the reward normaliser at snapshot t; None: the run has none."""
+        return self._stats("ret_norm", t) if self.info.ret_norm else None
+
+    def load_policy(self, t: int = -1) -> Policy:
+        """The policy of snapshot t, which acts as the agent did. Needs the extra ``sb3``.
+
+        Raises:
+            PolicyError: the run's policy cannot be rebuilt; the message says why.
+        """
+        from weighttraj.policies.policy import load_policy
+
+        return load_policy(self, t)
+
+    def _stats(self, group: str, t: int) -> NormStats:
+        mean, var, count = (self[f"{group}/{name}"][t] for name in ("mean", "var", "count"))
+        return NormStats(mean=mean, var=var, count=float(count))
+
+    def __repr__(self) -> str:
+        info = self.info
+        what = [info.algorithm.name] if info.algorithm else []
+        what += [info.env.id] if info.env else []
+        return (
+            f"<Run {self.id}: {' '.join(what)} seed {info.seed}, weights "
+            f"(time {len(self)}, param {self.layout.size}), {info.status}>"
+        )
+
+
+class Dataset:
+    """A data set, or a selection of its runs."""
+
+    def __init__(self, path: Path, info: DatasetInfo, runs: Sequence[Run]) -> None:
+        self.path = path
+        self.info = info
+        self.runs = list(runs)
+
+    def split(self, name: Literal["train", "validation", "test"]) -> Dataset:
+        """The runs of one part.
+
+        Raises:
+            FormatError: the part has no runs.
+        """
+        runs = [run for run in self.runs if run.split == name]
+        if not runs:
+            raise FormatError(
+                "this part of the data set has no runs",
+                expected="a split that dataset.json names",
+                got=f"{name!r}; there are {sorted({run.split for run in self.runs})}",
+                where=self.path,
+                do="name the split of each seed in the recipe",
+            )
+        return Dataset(self.path, self.info, runs)
+
+    def to_torch(self, window: int = 20, *, stride: int = 1) -> WindowDataset:
+        """Windows of consecutive snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
+
+        See ``weighttraj.load.WindowDataset``.
+        """
+        from weighttraj.load.windows import WindowDataset
+
+        return WindowDataset(self.runs, window=window, stride=stride)
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    def __iter__(self) -> Iterator[Run]:
+        return iter(self.runs)
+
+    def __repr__(self) -> str:
+        lines = [f"<Dataset {self.info.id} ({self.info.status}), {len(self)} runs>"]
+        return "\n".join(lines + [f"  {run.split or '-':<10} {run!r}" for run in self.runs])
+
+
+def open_dataset(path: str | Path) -> Dataset:
+    """Open a data set's folder.
+
+    A data set that is still being collected opens too, with the runs that exist so far.
+
+    Raises:
+        FileNotFoundError: there is no data set at the path.
+        FormatError: it is none of this format.
+        DamageError: it is complete but lacks a run that it lists.
+    """
+    path = Path(path)
+    info = read_dataset_info(path)
+    runs = []
+    for entry in info.runs:
+        if (path / entry.path / "zarr.json").is_file():
+            runs.append(_open_entry(path, entry))
+        elif info.status == "complete":
+            raise DamageError(
+                "the data set lacks a run that it lists",
+                expected=entry.path,
+                got="no such run",
+                where=path,
+                do="restore the run's folder from a copy, or collect it again",
+            )
+    return Dataset(path, info, runs)
+
+
+def open_run(path: str | Path) -> Run:
+    """Open one run's folder, ``<data set>/runs/<id>.zarr``.
+
+    Raises:
+        FileNotFoundError: there is no run at the path.
+        FormatError: it is none of this format.
+    """
+    return Run(path)
+
+
+def read_dataset_info(path: Path) -> DatasetInfo:
+    """Parse ``dataset.json``; raises as ``open_dataset`` does."""
+    file = path / "dataset.json"
+    if not file.is_file():
+        hint = "; this is one run: use open_run" if (path / "zarr.json").is_file() else ""
+        raise FileNotFoundError(f"no data set at {path}: it has no dataset.json{hint}")
+    return parse_json(file.read_bytes(), DatasetInfo, file)
+
+
+def _open_entry(path: Path, entry: RunEntry) -> Run:
+    run = Run(path / entry.path, entry.split)
+    if run.id != entry.id:
+        raise FormatError(
+            "a run is not the one that the data set lists",
+            expected=entry.id,
+            got=run.id,
+            where=run.path,
+            do="restore the run's folder from a copy",
+        )
+    return run
+
+
+def _rows(key: Any, n: int, where: str) -> Any:
+    """A row selection with non-negative bounds inside the committed rows."""
+    if isinstance(key, slice):
+        start, stop, step = key.indices(n)
+        if step < 1:
+            raise IndexError(f"slices go forward only (step {step}) in {where}")
+        return slice(start, max(start, stop), step)
+    index = np.asarray(key)
+    if index.dtype.kind not in "iu" or ((index < -n) | (index >= n)).any():
+        raise IndexError(f"row {key!r} is not one of the {n} committed rows of {where}")
+    index = np.where(index < 0, index + n, index)
+    return int(index) if index.ndim == 0 else index
+
+
+__all__ = ["Dataset", "NormStats", "Run", "StoredArray", "open_dataset", "open_run"]

@@ -1,0 +1,409 @@
+"""What the metadata of runs and data sets say, and which arrays follow from it.
+
+JSON is parsed here, at the border, into frozen dataclasses; everything inside trusts them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+
+from weighttraj.errors import FormatError, NewerFormatError
+from weighttraj.format.layout import ParamLayout
+
+FORMAT_VERSION = 1
+"""Version of the bytes on disk. It moves when they change, not with the package."""
+
+Status = Literal["collecting", "complete", "crashed"]
+Axis = Literal["time", "iteration"]
+
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_MAX_ROW = 2**31  # elements; beyond it a snapshot is taken for damaged metadata
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObsNorm:
+    """How raw observations become the network's inputs: ``clip((obs - mean) / sqrt(var + eps))``.
+
+    The statistics move with training and are stored for every snapshot; this holds what is fixed.
+    """
+
+    source: str
+    """Who normalised: ``gymnasium.NormalizeObservation``, ``stable_baselines3.VecNormalize``."""
+    epsilon: float
+    """Added to the variance."""
+    shape: tuple[int, ...]
+    """Shape of one observation."""
+    clip_low: float | None = None
+    """Lower bound of the normalised observation; None: not clipped."""
+    clip_high: float | None = None
+    """Upper bound of the normalised observation; None: not clipped."""
+    dtype: str = "float64"
+    """Type in which the trainer kept the statistics; the store keeps float64, which holds both."""
+    cast_before_clip: bool = True
+    """Whether values become float32 before (Gymnasium) or after (SB3) they are clipped."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicySpec:
+    """What it takes to rebuild the policy's function from its weights."""
+
+    kind: Literal["mlp", "other"]
+    """``mlp``: fully connected, rebuilt by ``Run.load_policy``."""
+    head: Literal["gaussian", "categorical", "other"] = "other"
+    """Distribution over actions; the Gaussian's deviation is the parameter ``log_std``."""
+    activation: str = ""
+    """Name of the hidden activation: tanh, relu, elu, leaky_relu."""
+    layers: tuple[tuple[str, str], ...] = ()
+    """(weight, bias) parameter names from the first layer to the action layer."""
+    observation_shape: tuple[int, ...] = ()
+    """Shape of one observation."""
+    action_shape: tuple[int, ...] = ()
+    """Shape of one action; empty for discrete actions."""
+    action_low: tuple[float, ...] = ()
+    """Lower bounds of a continuous action, flattened; actions are clipped to them."""
+    action_high: tuple[float, ...] = ()
+    """Upper bounds of a continuous action, flattened."""
+    action_start: int = 0
+    """First value of a discrete action."""
+    cannot_rebuild: tuple[str, ...] = ()
+    """Reasons why the policy cannot be rebuilt from this description; empty: it can."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvInfo:
+    """The environment, as Gymnasium's registry knows it."""
+
+    id: str
+    """Id for ``gymnasium.make``."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments for ``gymnasium.make``."""
+    max_episode_steps: int | None = None
+    """Time limit in steps, exclusive of nothing: an episode has at most this many."""
+    spec: dict[str, Any] = field(default_factory=dict)
+    """``EnvSpec.to_json()`` of the unwrapped environment, for the record."""
+    wrappers: tuple[str, ...] = ()
+    """Class names of the wrappers, outermost first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cadence:
+    """When snapshots are taken."""
+
+    every: int
+    """Gradient steps from one snapshot to the next."""
+    gradient_steps_per_iteration: int | None = None
+    """Gradient steps of one iteration (rollout and update); None: it varies."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """The training algorithm."""
+
+    name: str
+    """Class name: PPO, A2C."""
+    library: str = ""
+    """Library that trained it."""
+    hyperparameters: dict[str, Any] = field(default_factory=dict)
+    """Plain values; a schedule is a table of (progress_remaining, value) pairs, never code."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a run comes from: what must be equal for it to repeat bit by bit."""
+
+    created: str = ""
+    """UTC time, ISO 8601."""
+    packages: dict[str, str] = field(default_factory=dict)
+    """Versions of python and of each library that moves the numbers."""
+    platform: str = ""
+    """Operating system and architecture."""
+    cpu: str = ""
+    """Model of the processor."""
+    threads: int | None = None
+    """Threads of torch during training; another number gives other bits."""
+    command: str = ""
+    """Command line."""
+    commit: str = ""
+    """Version-control commit of the working directory; empty: none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """Everything about one run that is no array. Lives in the attributes of its Zarr group."""
+
+    run_id: str
+    """Unique in its data set; letters, digits, dot, underscore and hyphen."""
+    layout: ParamLayout
+    """Order of the policy's parameters in ``policy/weights``."""
+    policy: PolicySpec = PolicySpec(
+        kind="other", cannot_rebuild=("the writer did not describe it",)
+    )
+    """How the weights act."""
+    env: EnvInfo | None = None
+    """Environment; None: not said."""
+    algorithm: Algorithm | None = None
+    """Algorithm; None: not said."""
+    seed: int | None = None
+    """Seed of the run."""
+    cadence: Cadence | None = None
+    """When snapshots were taken; None: not said."""
+    obs_norm: ObsNorm | None = None
+    """Observation normaliser; None: the run has none."""
+    ret_norm: bool = False
+    """Whether statistics of a reward normaliser are stored."""
+    diagnostics: tuple[str, ...] = ()
+    """Names of the arrays under ``train/``."""
+    critic_layout: ParamLayout | None = None
+    """Order of parameters in ``critic/weights``; None: not stored."""
+    optimizer_moments: bool = False
+    """Whether Adam's moments of the policy's parameters are stored."""
+    probe_observations: int = 0
+    """Network inputs kept an iteration; 0: none."""
+    provenance: Provenance = Provenance()
+    """Versions and machine."""
+    block: int = 64
+    """Snapshots in one chunk, and in one commit."""
+    status: Status = "collecting"
+    """``collecting``: being written, or killed; ``complete``; ``crashed``: ended by an error."""
+    n_committed: int = 0
+    """Snapshots that readers may see."""
+    n_committed_iterations: int = 0
+    """Rows of iteration-indexed arrays that readers may see."""
+    format_version: int = FORMAT_VERSION
+    """Version of the format."""
+
+    def __post_init__(self) -> None:
+        check_id(self.run_id, "run id")
+        counts = (self.block - 1, self.n_committed, self.n_committed_iterations)
+        if min(*counts, self.probe_observations) < 0 or self.layout.size > _MAX_ROW:
+            raise FormatError(
+                "a count in the metadata is out of range",
+                expected="block at least 1, other counts at least 0, fewer than 2**31 parameters",
+                got=f"block {self.block}, n_committed {self.n_committed}, "
+                f"n_committed_iterations {self.n_committed_iterations}, "
+                f"probe_observations {self.probe_observations}, {self.layout.size} parameters",
+                where=f"run {self.run_id!r}",
+                do="restore the run's zarr.json from a copy",
+            )
+
+    def committed(self, axis: Axis) -> int:
+        """Rows along an axis that readers may see."""
+        return self.n_committed if axis == "time" else self.n_committed_iterations
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunEntry:
+    """One line of a data set's list of runs."""
+
+    id: str
+    """Id of the run."""
+    path: str
+    """Path from the data set's folder, with forward slashes."""
+    seed: int | None = None
+    """Seed of the run."""
+    split: Literal["train", "validation", "test", ""] = ""
+    """Part of the data set it belongs to. Splits are by run, never by time."""
+
+    def __post_init__(self) -> None:
+        check_id(self.id, "run id")
+        if self.path != f"runs/{self.id}.zarr":
+            raise FormatError(
+                "a run must lie in its data set, under its own name",
+                expected=f"runs/{self.id}.zarr",
+                got=self.path,
+                where=f"run {self.id!r} in dataset.json",
+                do="do not use data from a source that you do not trust",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetInfo:
+    """``dataset.json``: the list of runs, so that no reader needs to list folders."""
+
+    id: str
+    """Id of the data set, ``<env>-<algorithm>-v<N>``."""
+    runs: tuple[RunEntry, ...] = ()
+    """Every run that the data set holds or, while collecting, will hold."""
+    status: Literal["collecting", "complete"] = "collecting"
+    """A complete data set has all its runs."""
+    version: str = "1"
+    """Version of the data, not of the format."""
+    licence: str = "CC-BY-4.0"
+    """Licence of the data."""
+    recipe: dict[str, Any] = field(default_factory=dict)
+    """Recipe that makes it."""
+    format_version: int = FORMAT_VERSION
+    """Version of the format."""
+
+    def __post_init__(self) -> None:
+        check_id(self.id, "data set id")
+        ids = [run.id for run in self.runs]
+        if len(set(ids)) != len(ids):
+            raise FormatError("run ids in a data set must be unique", got=ids, where=self.id)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArraySpec:
+    """One array of a run: everything but its length."""
+
+    name: str
+    """Path in the run's group."""
+    dtype: str
+    """Numpy name of the element type."""
+    inner: tuple[int, ...]
+    """Shape of one row."""
+    dims: tuple[str, ...]
+    """Names of the dimensions, the row axis first."""
+
+    @property
+    def axis(self) -> Axis:
+        """What a row stands for: a snapshot (time) or an iteration."""
+        return "iteration" if self.dims[0] == "iteration" else "time"
+
+    @property
+    def fill(self) -> float | int:
+        """Value of a row that was never given: NaN, or -1 for integers."""
+        kind = np.dtype(self.dtype).kind
+        return float("nan") if kind == "f" else (0 if kind == "u" else -1)
+
+
+def arrays_of(info: RunInfo) -> dict[str, ArraySpec]:
+    """The arrays of a run, by name, in the order of ``FORMAT.md``."""
+    param = (info.layout.size,)
+    specs = [
+        _array("policy/weights", "float32", param, "param"),
+        _array("digest", "uint8", (32,), "byte"),
+        *(_array(f"index/{name}", "int64") for name in INDEX_COUNTERS),
+        _array("index/learning_rate", "float64"),
+        *(_array(f"train/{name}", "float64") for name in info.diagnostics),
+    ]
+    if info.obs_norm is not None:
+        dims = _observation_dims(info.obs_norm.shape)
+        specs += [_array(f"obs_norm/{s}", "float64", info.obs_norm.shape, *dims) for s in MOMENTS]
+        specs.append(_array("obs_norm/count", "float64"))
+    if info.ret_norm:
+        specs += [_array(f"ret_norm/{name}", "float64") for name in (*MOMENTS, "count")]
+    if info.critic_layout is not None:
+        critic = (info.critic_layout.size,)
+        specs.append(_array("critic/weights", "float32", critic, "critic_param"))
+    if info.optimizer_moments:
+        specs += [_array(f"optimizer/{m}", "float32", param, "param") for m in ADAM_MOMENTS]
+    if info.probe_observations:
+        shape = info.policy.observation_shape
+        inner, dims = (info.probe_observations, *shape), ("probe", *_observation_dims(shape))
+        specs.append(_array("probe/observations", "float32", inner, *dims, axis="iteration"))
+    return {spec.name: spec for spec in specs}
+
+
+INDEX_COUNTERS = ("iteration", "epoch", "gradient_step", "num_timesteps", "phase")
+MOMENTS = ("mean", "var")
+ADAM_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def _observation_dims(shape: tuple[int, ...]) -> tuple[str, ...]:
+    return ("obs",) if len(shape) == 1 else tuple(f"obs_{i}" for i in range(len(shape)))
+
+
+def _array(
+    name: str, dtype: str, inner: tuple[int, ...] = (), *dims: str, axis: Axis = "time"
+) -> ArraySpec:
+    return ArraySpec(name=name, dtype=dtype, inner=inner, dims=(axis, *dims))
+
+
+T = TypeVar("T", RunInfo, DatasetInfo)
+
+
+def parse(document: object, kind: type[T], where: object) -> T:
+    """Parse JSON metadata.
+
+    Raises:
+        NewerFormatError: a later version of the format wrote it.
+        FormatError: it is no metadata of this kind, or out of range.
+    """
+    version = document.get("format_version") if isinstance(document, dict) else None
+    if isinstance(version, int) and version > FORMAT_VERSION:
+        raise NewerFormatError(
+            "the data is in a newer format than this version of weighttraj reads",
+            expected=f"format_version at most {FORMAT_VERSION}",
+            got=version,
+            where=where,
+            do="pip install --upgrade weighttraj",
+        )
+    try:
+        return msgspec.convert(document, kind)
+    except msgspec.ValidationError as error:
+        raise FormatError(
+            f"the metadata is not a valid {kind.__name__}",
+            expected=f"what FORMAT.md says for format_version {FORMAT_VERSION}",
+            got=error,
+            where=where,
+            do="restore the metadata from a copy; the arrays beside it may be whole",
+        ) from error
+
+
+def parse_json(text: bytes, kind: type[T], where: object) -> T:
+    """Parse JSON text; raises as ``parse`` does."""
+    return parse(load_json(text, where), kind, where)
+
+
+def load_json(text: bytes, where: object) -> Any:
+    """Any JSON value.
+
+    Raises:
+        FormatError: the text is no JSON.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(
+            "the metadata is no JSON",
+            got=error,
+            where=where,
+            do="restore the file from a copy; the arrays beside it may be whole",
+        ) from error
+
+
+def to_json(info: RunInfo | DatasetInfo) -> dict[str, Any]:
+    """Plain JSON values of the metadata.
+
+    Raises:
+        FormatError: it holds a value that JSON cannot.
+    """
+    try:
+        plain: dict[str, Any] = msgspec.to_builtins(info)
+        json.dumps(plain, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise FormatError(
+            "the metadata holds a value that JSON cannot",
+            expected="finite numbers, strings, booleans, None, lists and dicts of them",
+            got=error,
+            do="describe the value by plain data",
+        ) from error
+    return plain
+
+
+def check_id(value: str, what: str) -> str:
+    """Return a valid id: it names a file, so it cannot lead out of the folder.
+
+    Raises:
+        FormatError: the id is empty, too long or has other characters.
+    """
+    if _ID.fullmatch(value) is None:
+        raise FormatError(
+            f"invalid {what}",
+            expected="1 to 128 letters, digits, '.', '_' or '-', not starting with '.'",
+            got=repr(value),
+            do="rename it",
+        )
+    return value
+
+
+def with_progress(info: RunInfo, *, status: Status, time: int, iteration: int) -> RunInfo:
+    """The metadata after a commit."""
+    return replace(info, status=status, n_committed=time, n_committed_iterations=iteration)

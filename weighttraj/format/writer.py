@@ -1,0 +1,304 @@
+"""Writes one run: append, commit in blocks, continue."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from filelock import FileLock, Timeout
+from jaxtyping import Float32
+
+from weighttraj.errors import FormatError, ReplayError, SnapshotError, StoreLockedError
+from weighttraj.format.schema import ArraySpec, Axis, RunInfo, Status, with_progress
+from weighttraj.format.storage import RunStore
+
+Moments = tuple[np.ndarray, np.ndarray, float]
+"""Statistics of a normaliser: mean, variance, count."""
+
+
+class RunWriter:
+    """Writes the snapshots of one training run, from any trainer.
+
+    Snapshots are committed in blocks of ``info.block``. Readers see committed snapshots only, so
+    a process that is killed loses at most the block it was filling. Used as a context manager, it
+    marks the run ``complete``, or ``crashed`` when an exception passes; both commit what is left.
+
+    With ``resume=True`` a run that was interrupted is continued by doing it again: snapshots up to
+    the last committed one are compared with the stored ones and not written, later ones are
+    appended. Trainers such as Stable-Baselines3 cannot be resumed bit by bit; a seed can be
+    repeated.
+
+    Args:
+        path: folder of the run, ``<data set>/runs/<run id>.zarr``.
+        info: metadata. Its status and counts are the writer's business.
+        resume: continue the run at the path, if there is one.
+
+    Raises:
+        StoreExistsError: the path exists, and ``resume`` is False.
+        StoreLockedError: another process is writing this run.
+        FormatError: the run at the path has other arrays than ``info`` says, or is complete.
+    """
+
+    def __init__(self, path: str | Path, info: RunInfo, *, resume: bool = False) -> None:
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = _lock(path)
+        try:
+            if resume and path.exists():
+                self._store = _reopen(path, info)
+            else:
+                self._store = RunStore.create(path, with_progress(info, **_NOTHING))
+        except BaseException:
+            self._lock.release()
+            raise
+        info = self._store.info
+        self.path = path
+        self.replayed_from = info.n_committed
+        """Committed snapshots found at the start: that many are compared, not written."""
+        self._committed_digests = self._store.read("digest", slice(0, info.n_committed))
+        self._n_seen: dict[Axis, int] = {"time": 0, "iteration": 0}
+        self._buffers = {spec.name: self._tail(spec) for spec in self._store.specs.values()}
+        self._closed = False
+
+    @property
+    def info(self) -> RunInfo:
+        """Metadata as last committed."""
+        return self._store.info
+
+    def append(
+        self,
+        weights: Float32[np.ndarray, " param"],
+        *,
+        num_timesteps: int,
+        iteration: int = -1,
+        epoch: int = -1,
+        gradient_step: int = -1,
+        phase: int = -1,
+        learning_rate: float = float("nan"),
+        obs_norm: Moments | None = None,
+        ret_norm: Moments | None = None,
+        train: Mapping[str, float] | None = None,
+        critic: Float32[np.ndarray, " critic_param"] | None = None,
+        moments: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        """Append one snapshot.
+
+        Args:
+            weights: flat parameters, in the order of ``info.layout``.
+            num_timesteps: environment steps so far.
+            iteration: rollouts and updates begun so far; 0 before training, -1: not said.
+            epoch: passes over the rollout finished in this iteration; -1: not said.
+            gradient_step: optimizer steps so far; -1: not said.
+            phase: which part of the iteration ends here, from 0; -1: none, or not said.
+            learning_rate: of the gradient step that led here.
+            obs_norm: statistics of the observation normaliser; required if ``info.obs_norm``.
+            ret_norm: statistics of the reward normaliser; required if ``info.ret_norm``.
+            train: diagnostics known at this moment; NaN is stored for those left out.
+            critic: critic's parameters; required if ``info.critic_layout``.
+            moments: Adam's first and second moments; required if ``info.optimizer_moments``.
+
+        Raises:
+            SnapshotError: a value has another shape than the run's, is not finite, or is missing.
+            ReplayError: a continued run does not repeat what it had committed.
+        """
+        values: dict[str, Any] = {
+            "policy/weights": weights,
+            "index/learning_rate": learning_rate,
+            "index/iteration": iteration,
+            "index/epoch": epoch,
+            "index/gradient_step": gradient_step,
+            "index/num_timesteps": num_timesteps,
+            "index/phase": phase,
+            **{f"train/{name}": value for name, value in (train or {}).items()},
+            **_moments("obs_norm", obs_norm),
+            **_moments("ret_norm", ret_norm),
+            **({} if critic is None else {"critic/weights": critic}),
+            **({} if moments is None else dict(zip(_ADAM, moments, strict=True))),
+        }
+        digest = hashlib.sha256(np.ascontiguousarray(weights, "<f4").tobytes()).digest()
+        values["digest"] = np.frombuffer(digest, np.uint8)
+        self._append("time", values)
+
+    def append_iteration(self, probe_observations: Float32[np.ndarray, "probe *obs"]) -> None:
+        """Append one row of the iteration-indexed arrays: network inputs of its rollout.
+
+        Raises:
+            SnapshotError: the shape is not (``info.probe_observations``, *observation).
+        """
+        self._append("iteration", {"probe/observations": probe_observations})
+
+    def flush(self, status: Status = "collecting") -> None:
+        """Write and commit everything appended so far."""
+        store = self._store
+        for spec in store.specs.values():
+            rows = self._buffers[spec.name]
+            if rows:
+                store.write(self._start(spec), {spec.name: np.stack(rows)})
+        done = {a: max(n, store.info.committed(a)) for a, n in self._n_seen.items()}
+        store.commit(
+            with_progress(store.info, status=status, time=done["time"], iteration=done["iteration"])
+        )
+        for spec in store.specs.values():
+            full = len(self._buffers[spec.name]) // store.info.block * store.info.block
+            del self._buffers[spec.name][:full]
+
+    def close(self, status: Status = "complete") -> None:
+        """Commit what is left, mark the run and release the lock. Closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            if status == "complete" and self._n_seen["time"] < self.replayed_from:
+                raise ReplayError(
+                    "a continued run ended before the snapshots it had committed",
+                    expected=f"at least {self.replayed_from} snapshots",
+                    got=self._n_seen["time"],
+                    where=self.path,
+                    do="continue with the settings the run was started with",
+                )
+            self.flush(status)
+            self._store.trim()
+        finally:
+            self._lock.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close("complete" if kind is None else "crashed")
+
+    def _append(self, axis: Axis, values: Mapping[str, Any]) -> None:
+        if self._closed:
+            raise SnapshotError("the run is closed", where=self.path, do="open a new RunWriter")
+        specs = [spec for spec in self._store.specs.values() if spec.axis == axis]
+        rows = {spec.name: _row(spec, values) for spec in specs}
+        unknown = sorted(values.keys() - rows.keys())
+        if unknown:
+            raise SnapshotError(
+                "values that this run does not store",
+                expected=sorted(rows),
+                got=unknown,
+                where=self.path,
+                do="describe them in the RunInfo before the run starts",
+            )
+        n = self._n_seen[axis]
+        if n < self._store.info.committed(axis):
+            self._compare(n, rows)
+        else:
+            for name, row in rows.items():
+                self._buffers[name].append(row)
+        self._n_seen[axis] = n + 1
+        if any(len(self._buffers[spec.name]) == self._store.info.block for spec in specs):
+            self.flush()
+
+    def _compare(self, n: int, rows: Mapping[str, np.ndarray]) -> None:
+        if "digest" in rows and not np.array_equal(rows["digest"], self._committed_digests[n]):
+            raise ReplayError(
+                "the run does not repeat its committed snapshots",
+                expected=f"digest {self._committed_digests[n].tobytes().hex()[:16]}...",
+                got=f"digest {rows['digest'].tobytes().hex()[:16]}...",
+                where=f"{self.path}, snapshot {n}",
+                do="continue on the machine, with the versions and the thread count that "
+                "run.info.provenance names, or collect under a new run id",
+            )
+
+    def _start(self, spec: ArraySpec) -> int:
+        """Row at which the buffered block begins."""
+        last = max(self._n_seen[spec.axis], self._store.info.committed(spec.axis))
+        return last - len(self._buffers[spec.name])
+
+    def _tail(self, spec: ArraySpec) -> list[np.ndarray]:
+        """Rows of the last, partly filled block: it will be written again as a whole."""
+        n = self._store.info.committed(spec.axis)
+        start = n // self._store.info.block * self._store.info.block
+        return list(self._store.read(spec.name, slice(start, n)))
+
+
+_NOTHING: dict[str, Any] = {"status": "collecting", "time": 0, "iteration": 0}
+_ADAM = ("optimizer/exp_avg", "optimizer/exp_avg_sq")
+_MAY_BE_NAN = ("train/", "index/learning_rate")
+
+
+def _lock(path: Path) -> FileLock:
+    lock = FileLock(path.with_name(path.name + ".lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise StoreLockedError(
+            "another process is writing this run",
+            where=path,
+            do="wait for it or stop it; a lock of a dead process frees itself",
+        ) from error
+    return lock
+
+
+def _reopen(path: Path, info: RunInfo) -> RunStore:
+    store = RunStore.open(path)
+    old = store.info
+    if old.status == "complete":
+        raise FormatError(
+            "the run is complete; nothing can be added",
+            where=path,
+            do="choose another run id or path",
+        )
+    ours = replace(info, **{name: getattr(old, name) for name in _MAY_DIFFER})
+    if ours != old:
+        names = [n for n in vars(ours) if getattr(ours, n) != getattr(old, n)]
+        raise FormatError(
+            "the run was started with other settings",
+            expected={name: getattr(old, name) for name in names},
+            got={name: getattr(ours, name) for name in names},
+            where=path,
+            do="continue with the settings of the start, or choose another path",
+        )
+    return store
+
+
+_MAY_DIFFER = ("status", "n_committed", "n_committed_iterations", "provenance")
+
+
+def _moments(name: str, moments: Moments | None) -> dict[str, Any]:
+    if moments is None:
+        return {}
+    return dict(zip((f"{name}/mean", f"{name}/var", f"{name}/count"), moments, strict=True))
+
+
+def _row(spec: ArraySpec, values: Mapping[str, Any]) -> np.ndarray:
+    optional = spec.name.startswith(_MAY_BE_NAN)
+    if spec.name not in values and not optional:
+        raise SnapshotError(
+            "the snapshot lacks a value that this run stores",
+            expected=f"{spec.name}, {spec.dtype} {spec.inner}",
+            got=f"only {sorted(values)}",
+            do="pass it to append",
+        )
+    row = np.array(values.get(spec.name, spec.fill), spec.dtype)
+    if row.shape != spec.inner:
+        raise SnapshotError(
+            "a value of the snapshot has the wrong shape",
+            expected=spec.inner,
+            got=row.shape,
+            where=spec.name,
+            do="pass what the run's layout and normaliser describe",
+        )
+    if not optional and row.dtype.kind == "f" and not np.isfinite(row).all():
+        bad = np.flatnonzero(~np.isfinite(row))
+        raise SnapshotError(
+            "a value of the snapshot is not finite",
+            expected="finite numbers",
+            got=f"{bad.size} of {row.size} NaN or infinite, the first at {bad[0]}",
+            where=spec.name,
+            do="the training has diverged: lower the learning rate; "
+            "the snapshots before this one are kept",
+        )
+    return row

@@ -1,0 +1,16 @@
+"""Stored snapshots as policies that act, and their returns. Needs the extra ``sb3``."""
+
+from weighttraj.errors import missing_extra
+
+try:
+    import gymnasium as _gymnasium
+    import torch as _torch
+except ModuleNotFoundError as error:
+    raise missing_extra(str(error.name), "sb3") from error
+
+from weighttraj.policies.policy import Policy, load_policy
+from weighttraj.policies.rollout import EpisodeReturns, Evaluator, evaluate
+
+__all__ = ["EpisodeReturns", "Evaluator", "Policy", "evaluate", "load_policy"]
+
+del _gymnasium, _torch

@@ -1,0 +1,173 @@
+"""A stored snapshot as a policy that acts as the agent did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+from torch.distributions import Categorical, Normal
+from torch.nn import functional
+
+from weighttraj.errors import PolicyError
+from weighttraj.format import ParamLayout, PolicySpec, Run
+from weighttraj.format.reader import NormStats
+from weighttraj.format.schema import ObsNorm
+
+_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "": torch.nn.Identity(),
+    "tanh": torch.tanh,
+    "relu": functional.relu,
+    "elu": functional.elu,
+    "leaky_relu": functional.leaky_relu,
+}
+
+
+class Policy:
+    """A multilayer perceptron with a Gaussian or categorical head, and its normaliser.
+
+    Actions equal those of the SB3 agent bit by bit, for the same observations, batch size and
+    torch seed.
+
+    Args:
+        spec: structure of the network.
+        layout: order of the parameters in ``weights``.
+        weights: float32 (param,).
+        obs_norm: what is fixed about the normaliser; None: observations go in as they are.
+        stats: its statistics.
+
+    Raises:
+        PolicyError: the spec describes no policy that can be rebuilt.
+    """
+
+    def __init__(
+        self,
+        spec: PolicySpec,
+        layout: ParamLayout,
+        weights: Float32[np.ndarray, " param"],
+        obs_norm: ObsNorm | None = None,
+        stats: NormStats | None = None,
+    ) -> None:
+        if spec.kind != "mlp" or spec.activation not in _ACTIVATIONS or not spec.layers:
+            raise PolicyError(
+                "this policy cannot be rebuilt from its weights",
+                expected="a fully connected network on flat observations, with a Gaussian or "
+                f"categorical head and one of the activations {sorted(_ACTIVATIONS)}",
+                got="; ".join(spec.cannot_rebuild) or f"{spec.kind}, activation {spec.activation}",
+                do="rebuild it yourself from run.layout.unflatten(run.weights[t])",
+            )
+        self.spec = spec
+        self.layout = layout
+        self.obs_norm, self.stats = obs_norm, stats
+        self.weights = np.array(weights, np.float32)
+        tensors = {k: torch.from_numpy(v) for k, v in layout.unflatten(self.weights).items()}
+        try:
+            self._layers = [(tensors[weight], tensors[bias]) for weight, bias in spec.layers]
+            self._log_std = tensors["log_std"] if spec.head == "gaussian" else None
+        except KeyError as error:
+            raise PolicyError(
+                "the policy names a parameter that its layout lacks",
+                expected=[spec.name for spec in layout.params],
+                got=error,
+                do="restore the run's zarr.json from a copy",
+            ) from error
+
+    def with_weights(self, weights: Float32[np.ndarray, " param"]) -> Policy:
+        """The same structure and normaliser with other weights, such as a forecast's."""
+        return Policy(self.spec, self.layout, weights, self.obs_norm, self.stats)
+
+    def normalize(self, observation: np.ndarray) -> np.ndarray:
+        """Network inputs, float32, for raw observations of any batch shape."""
+        norm, stats = self.obs_norm, self.stats
+        if norm is None or stats is None:
+            return np.asarray(observation, np.float32)
+        mean, var = (x.astype(norm.dtype) for x in (stats.mean, stats.var))
+        inputs = (observation - mean) / np.sqrt(var + norm.epsilon)
+        if norm.cast_before_clip:
+            inputs = np.float32(inputs)
+        if norm.clip_low is not None or norm.clip_high is not None:
+            inputs = np.clip(inputs, norm.clip_low, norm.clip_high)
+        return np.asarray(inputs, np.float32)
+
+    @torch.no_grad()
+    def distribution(self, inputs: Tensor) -> Normal | Categorical:
+        """Distribution over unclipped actions for network inputs (batch, *observation)."""
+        hidden = inputs.flatten(1)
+        activation = _ACTIVATIONS[self.spec.activation]
+        for weight, bias in self._layers[:-1]:
+            hidden = activation(functional.linear(hidden, weight, bias))
+        outputs = functional.linear(hidden, *self._layers[-1])
+        if self._log_std is None:
+            return Categorical(logits=outputs, validate_args=False)
+        return Normal(outputs, torch.ones_like(outputs) * self._log_std.exp(), validate_args=False)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions for raw observations; SB3's signature.
+
+        Args:
+            observation: (*observation) or (batch, *observation), not normalised.
+            state: returned as it is; these policies have no memory.
+            episode_start: not used.
+            deterministic: the distribution's mode, else a sample by torch's global generator.
+
+        Returns:
+            Actions, clipped to the action space, batched as the observations are; and ``state``.
+
+        Raises:
+            PolicyError: the observations have another shape.
+        """
+        observation = np.asarray(observation)
+        shape = self.spec.observation_shape
+        batched = observation.ndim == len(shape) + 1
+        if observation.shape[int(batched) :] != shape:
+            raise PolicyError(
+                "the observation has the wrong shape",
+                expected=f"{shape} or (batch, {', '.join(map(str, shape))})",
+                got=observation.shape,
+                do="pass observations of the run's environment",
+            )
+        inputs = self.normalize(observation if batched else observation[None])
+        distribution = self.distribution(torch.from_numpy(inputs))
+        actions = self._choose(distribution, deterministic)
+        return (actions if batched else actions[0]), state
+
+    def _choose(self, distribution: Normal | Categorical, deterministic: bool) -> np.ndarray:
+        if isinstance(distribution, Categorical):
+            choice = distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call]
+            return self.to_actions(choice)
+        return self.to_actions(distribution.mean if deterministic else distribution.rsample())
+
+    def to_actions(self, values: Tensor) -> np.ndarray:
+        """Actions for the environment: shaped, and clipped to the action space."""
+        if self._log_std is None:
+            return np.asarray(values.numpy() + self.spec.action_start)
+        shape = self.spec.action_shape
+        low, high = (
+            np.array(x, np.float32).reshape(shape)
+            for x in (self.spec.action_low, self.spec.action_high)
+        )
+        return np.asarray(np.clip(values.numpy().reshape(-1, *shape), low, high))
+
+    def __repr__(self) -> str:
+        units = [len(bias) for _, bias in self._layers]
+        return f"<Policy {self.spec.head}, {self.spec.activation}, units {units}>"
+
+
+def load_policy(run: Run, t: int = -1) -> Policy:
+    """The policy of snapshot t of a run, with the normaliser that it acted with at t.
+
+    Raises:
+        PolicyError: the run's policy cannot be rebuilt; the message says why.
+        IndexError: there is no such snapshot.
+    """
+    weights: Any = run.weights[t]
+    return Policy(run.info.policy, run.layout, weights, run.info.obs_norm, run.obs_norm(t))
