@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from weighttraj.format import Algorithm, Cadence, Provenance
+from weighttraj.errors import CollectError
+from weighttraj.format import Algorithm, Cadence, EnvInfo, ParamLayout, PolicySpec, Provenance
 from weighttraj.format.layout import Role
 
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy", "zarr", "weighttraj")
@@ -62,6 +64,103 @@ def check_model(model: BaseAlgorithm) -> OnPolicyAlgorithm:
     Raises:
         CollectError: it is no on-policy algorithm with one optimizer.
     """
+    names = [
+        f"{prefix}.{name}".lstrip(".")
+        for prefix, module in model.policy.named_modules()
+        for name, value in vars(module).items()
+        if isinstance(value, torch.optim.Optimizer)
+    ]
+    if names != ["optimizer"]:
+        raise CollectError(
+            "the collector counts the steps of one optimizer, and this policy has another number",
+            expected="policy.optimizer, as in PPO and A2C",
+            got=names,
+            where=type(model).__name__,
+            do="collect PPO or A2C, or write snapshots yourself with weighttraj.RunWriter",
+        )
+    if not isinstance(model, OnPolicyAlgorithm):
+        raise CollectError(
+            "only on-policy algorithms can be collected by this callback",
+            expected="PPO or A2C",
+            got=type(model).__name__,
+            do="write snapshots yourself with weighttraj.RunWriter",
+        )
+    return model
+
+
+def actor_parameters(policy: ActorCriticPolicy) -> dict[str, nn.Parameter]:
+    """Parameters that the policy acts with, in the order of the flat vector."""
+    named = policy.named_parameters()
+    return {name: p for name, p in named if not name.startswith(_CRITIC)}
+
+
+def critic_parameters(policy: ActorCriticPolicy) -> dict[str, nn.Parameter]:
+    """Parameters that only the critic uses."""
+    return {name: p for name, p in policy.named_parameters() if name.startswith(_CRITIC)}
+
+
+def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> ParamLayout:
+    """Order, shape, role and symmetry of the parameters."""
+    axes: dict[str, tuple[str, ...]] = {}
+    for i, (weight, bias) in enumerate(policy.layers):
+        inputs = "observation" if i == 0 else f"hidden_{i - 1}"
+        outputs = "action" if i == len(policy.layers) - 1 else f"hidden_{i}"
+        axes[weight], axes[bias] = (outputs, inputs), (outputs,)
+    tensors: dict[str, tuple[tuple[int, ...], Role, tuple[str, ...]]] = {}
+    for name, parameter in parameters.items():
+        shape = tuple(parameter.shape)
+        labels = axes.get(name, ("action",) if name == "log_std" else ("fixed",) * len(shape))
+        tensors[name] = (shape, _role(name), labels)
+    return ParamLayout.of(tensors)
+
+
+def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
+    """What it takes to rebuild the policy, or the reasons why it cannot be."""
+    space = policy.observation_space
+    layers, activation, reasons = _mlp(policy)
+    head: dict[str, Any] = {"head": "other"}
+    if isinstance(policy.action_space, spaces.Box) and not policy.use_sde:
+        head = {
+            "head": "gaussian",
+            "action_shape": policy.action_space.shape,
+            "action_low": tuple(policy.action_space.low.reshape(-1).tolist()),
+            "action_high": tuple(policy.action_space.high.reshape(-1).tolist()),
+        }
+    elif isinstance(policy.action_space, spaces.Discrete):
+        head = {"head": "categorical", "action_start": int(policy.action_space.start)}
+    else:
+        reasons.append(f"actions in {policy.action_space}, or state-dependent exploration")
+    if policy.squash_output:
+        reasons.append("actions squashed by tanh")
+    if not isinstance(space, spaces.Box):
+        reasons.append(f"observations in a {type(space).__name__} space")
+    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
+    return PolicySpec(
+        kind="other" if reasons else "mlp",
+        activation=activation,
+        layers=layers,
+        observation_shape=tuple(space.shape or ()) if isinstance(space, spaces.Box) else (),
+        cannot_rebuild=tuple(reasons),
+        **head,
+    )
+
+
+def describe_env(model: OnPolicyAlgorithm, wrappers: tuple[str, ...]) -> EnvInfo | None:
+    """The environment as Gymnasium's registry knows it; None: it is not registered."""
+    spec = model.env.get_attr("spec", indices=[0])[0] if model.env is not None else None
+    if spec is None:
+        return None
+    return EnvInfo(
+        id=spec.id,
+        kwargs=_plain(spec.kwargs),
+        max_episode_steps=spec.max_episode_steps,
+        spec={"entry_point": str(spec.entry_point), "reward_threshold": spec.reward_threshold},
+        wrappers=wrappers,
+    )
+
+
+def describe_algorithm(model: OnPolicyAlgorithm) -> Algorithm:
+    """Name and hyper-parameters; schedules become tables over the progress that remains."""
     values = {n: _plain(getattr(model, n)) for n in HYPERPARAMETERS if hasattr(model, n)}
     for name in ("lr_schedule", "clip_range", "clip_range_vf"):
         schedule = getattr(model, name, None)
