@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float32
@@ -35,7 +34,7 @@ class Persistence:
         (Path(path) / "config.json").write_text(json.dumps({"kind": self.name}))
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path) -> Persistence:
         """A new one."""
         return cls()
 
@@ -67,6 +66,6 @@ class Reconstruction:
         (Path(path) / "config.json").write_text(json.dumps({"kind": self.name, "rank": self.rank}))
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path) -> Reconstruction:
         """Read the rank."""
         return cls(json.loads((Path(path) / "config.json").read_text())["rank"])

@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -52,7 +52,7 @@ class Forecaster(Protocol):
         ...
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path) -> Forecaster:
         """Read what ``save`` wrote."""
         ...
 
@@ -138,7 +138,7 @@ class TIPL:
         (path / "config.json").write_text(json.dumps(asdict(self.config), indent=1))
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path) -> TIPL:
         """Read a saved model; every parameter must be there.
 
         Raises:

@@ -8,7 +8,6 @@ of U, cut to the first d columns.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from jaxtyping import Float
@@ -35,7 +34,7 @@ class TemporalSVD:
     """Squared Frobenius norm of the weights: the sum of *all* squared singular values."""
 
     @classmethod
-    def fit(cls, weights: Float[np.ndarray, "time param"], rank: int) -> Self:
+    def fit(cls, weights: Float[np.ndarray, "time param"], rank: int) -> TemporalSVD:
         """Basis of a trajectory.
 
         Signs are arbitrary in an SVD. Here each column of U has a positive sum over the first

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 import torch
@@ -31,7 +30,7 @@ class Batch:
     """float32 (batch, rank): squared singular values over P. They turn squared errors of
     coefficients into the mean squared error of policy weights."""
 
-    def to(self, device: str) -> Self:
+    def to(self, device: str) -> Batch:
         """The same batch on another device."""
         return replace(self, **{name: tensor.to(device) for name, tensor in vars(self).items()})
 
@@ -46,7 +45,7 @@ class TokenRun:
     """Squared singular values over P."""
 
     @classmethod
-    def of(cls, svd: TemporalSVD, weights: Float[np.ndarray, "time param"]) -> Self:
+    def of(cls, svd: TemporalSVD, weights: Float[np.ndarray, "time param"]) -> TokenRun:
         """Coefficients of a trajectory in its basis."""
         return cls(
             coefficients=svd.transform(weights).astype(np.float32),

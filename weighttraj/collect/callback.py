@@ -28,6 +28,7 @@ from weighttraj.collect.normalizers import Normalizers, find_normalizers
 from weighttraj.errors import CollectError
 from weighttraj.format import RunInfo, RunWriter
 from weighttraj.format.schema import Status
+from weighttraj.format.writer import check_finite
 
 
 class WeightTrajectoryCallback(BaseCallback):
@@ -187,10 +188,11 @@ class WeightTrajectoryCallback(BaseCallback):
         """Copy the policy as it is now; it is appended when the next one comes."""
         self._append_pending()
         policy, norm = self._algorithm.policy, self._norm
+        weights = check_finite("policy/weights", _flat([p.detach() for p in self._actor.values()]))
         steps = self._step - self._step_before
         per_epoch = self._steps_per_epoch()
         self._pending = {
-            "weights": _flat([p.detach() for p in self._actor.values()]),
+            "weights": weights,
             "num_timesteps": self._algorithm.num_timesteps,
             "iteration": self._iteration,
             "epoch": steps // per_epoch if per_epoch else -1,

@@ -109,7 +109,7 @@ def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> 
     tensors: dict[str, tuple[tuple[int, ...], Role, tuple[str, ...]]] = {}
     for name, parameter in parameters.items():
         shape = tuple(parameter.shape)
-        labels = axes.get(name, ("action",) if name == "log_std" else ("fixed",) * len(shape))
+        labels = axes.get(name, ("action" if name == "log_std" else "fixed",) * len(shape))
         tensors[name] = (shape, _role(name), labels)
     return ParamLayout.of(tensors)
 

@@ -143,4 +143,4 @@ class ParamLayout:
                 do="pass whole snapshots, as run.weights[...] returns them",
             )
         batch = weights.shape[:-1]
-        return {s.name: weights[..., s.slice].reshape(*batch, *s.shape) for s in self.params}
+        return {s.name: weights[..., s.slice].reshape((*batch, *s.shape)) for s in self.params}

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -166,7 +166,7 @@ class RunWriter:
         finally:
             self._lock.release()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> RunWriter:
         return self
 
     def __exit__(
@@ -221,7 +221,7 @@ class RunWriter:
         """Rows of the last, partly filled block: it will be written again as a whole."""
         n = self._store.info.committed(spec.axis)
         start = n // self._store.info.block * self._store.info.block
-        return list(self._store.read(spec.name, slice(start, n)))
+        return [np.asarray(row) for row in self._store.read(spec.name, slice(start, n))]
 
 
 _NOTHING: dict[str, Any] = {"status": "collecting", "time": 0, "iteration": 0}
@@ -291,13 +291,22 @@ def _row(spec: ArraySpec, values: Mapping[str, Any]) -> np.ndarray:
             where=spec.name,
             do="pass what the run's layout and normaliser describe",
         )
-    if not optional and row.dtype.kind == "f" and not np.isfinite(row).all():
-        bad = np.flatnonzero(~np.isfinite(row))
+    return row if optional or row.dtype.kind != "f" else check_finite(spec.name, row)
+
+
+def check_finite(name: str, row: np.ndarray) -> np.ndarray:
+    """Return a row of finite numbers.
+
+    Raises:
+        SnapshotError: some are NaN or infinite.
+    """
+    bad = np.flatnonzero(~np.isfinite(row))
+    if bad.size:
         raise SnapshotError(
             "a value of the snapshot is not finite",
             expected="finite numbers",
             got=f"{bad.size} of {row.size} NaN or infinite, the first at {bad[0]}",
-            where=spec.name,
+            where=name,
             do="the training has diverged: lower the learning rate; "
             "the snapshots before this one are kept",
         )

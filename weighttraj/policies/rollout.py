@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -70,7 +70,7 @@ class Evaluator:
         for env in self._envs:
             env.close()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Evaluator:
         return self
 
     def __exit__(

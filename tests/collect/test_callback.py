@@ -1,0 +1,407 @@
+"""The collector on real short trainings: what it stores is what the agent was."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+
+import weighttraj as wt
+from tests.small import CONFIGS, SMALL, learn
+from weighttraj.collect import WeightTrajectoryCallback, make_ppo
+from weighttraj.collect.describe import actor_parameters
+from weighttraj.errors import CollectError, PolicyError, SnapshotError, StoreExistsError
+
+
+def flat(model: Any) -> np.ndarray:
+    parameters = [p.detach().reshape(-1) for p in actor_parameters(model.policy).values()]
+    return torch.cat(parameters).numpy()
+
+
+class Witness(BaseCallback):
+    """Records the live agent at every gradient step, without moving the random state."""
+
+    def __init__(self, raw: np.ndarray) -> None:
+        super().__init__()
+        self.raw = raw
+        self.agents: list[dict[str, Any]] = []
+        self.stats: list[Any] = []
+
+    def _on_training_start(self) -> None:
+        self.model.policy.optimizer.register_step_post_hook(self._look)
+        self._look()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.stats.append(copy.deepcopy(live_stats(self.model)))
+
+    def _look(self, *_: object) -> None:
+        state = torch.get_rng_state()
+        inputs = live_inputs(self.model, self.raw)
+        deterministic = self.model.policy.predict(inputs, deterministic=True)[0]
+        torch.manual_seed(5)
+        sampled = self.model.policy.predict(inputs)[0]
+        self.model.policy.set_training_mode(True)
+        torch.set_rng_state(state)
+        self.agents.append(
+            {"weights": flat(self.model), "deterministic": deterministic, "sampled": sampled}
+        )
+
+
+def live_stats(model: Any) -> Any:
+    env = model.get_env()
+    if isinstance(env, VecNormalize):
+        return env.obs_rms
+    normalizers = [
+        w for w in chain(env.envs[0]) if isinstance(w, gym.wrappers.NormalizeObservation)
+    ]
+    return normalizers[0].obs_rms if normalizers else None
+
+
+def live_inputs(model: Any, raw: np.ndarray) -> np.ndarray:
+    """Raw observations as the training environment's own code would show them to the agent."""
+    env = model.get_env()
+    if isinstance(env, VecNormalize):
+        return env.normalize_obs(raw)  # type: ignore[return-value]
+    inputs = []
+    for row in raw:
+        for wrapper in reversed(chain(env.envs[0])):
+            if isinstance(wrapper, gym.wrappers.NormalizeObservation):
+                wrapper.update_running_mean = False
+                row = wrapper.observation(row)
+                wrapper.update_running_mean = True
+            elif isinstance(wrapper, gym.ObservationWrapper):
+                row = wrapper.observation(row)
+        inputs.append(row)
+    return np.stack(inputs)
+
+
+def chain(env: Any) -> list[Any]:
+    wrappers = []
+    while isinstance(env, gym.Wrapper):
+        wrappers.append(env)
+        env = env.env
+    return wrappers
+
+
+def test_training_is_the_same_with_and_without_the_collector(tmp_path: Path) -> None:
+    script = Path(__file__).with_name("neutrality.py")
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", script, tmp_path],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result == {name: {"weights": True, "random": True} for name in CONFIGS}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_stored_policies_act_bit_by_bit_as_the_agent_did(name: str, tmp_path: Path) -> None:
+    space = gym.make(CONFIGS[name].env_id).observation_space
+    rng = np.random.default_rng(0)
+    raw = (rng.normal(size=(16, *space.shape)) * 3).astype(space.dtype)  # type: ignore[misc]
+    witness = Witness(raw)
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=2)
+    learn(CONFIGS[name], [callback, witness])
+    run = wt.open_run(tmp_path / "run.zarr")
+    seen = [witness.agents[i] for i in run["index/gradient_step"][:]]
+    assert len(run) == len(seen) == 17
+    for t, agent in enumerate(seen):
+        policy = run.load_policy(t)
+        assert np.array_equal(run.weights[t], agent["weights"])
+        assert np.array_equal(policy.predict(raw, deterministic=True)[0], agent["deterministic"])
+        torch.manual_seed(5)
+        assert np.array_equal(policy.predict(raw)[0], agent["sampled"])
+    assert not np.array_equal(seen[0]["weights"], seen[-1]["weights"])
+
+
+@pytest.mark.parametrize("name", ["gymnasium", "vecnormalize", "categorical"])
+def test_stored_statistics_are_the_live_normalisers(name: str, tmp_path: Path) -> None:
+    witness = Witness(np.zeros((1, 4)))
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=4)
+    learn(CONFIGS[name], [callback, witness])
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert run.info.obs_norm is not None
+    for t, iteration in enumerate(run.iteration):
+        stats = run.obs_norm(t)
+        assert stats is not None
+        if iteration:
+            live = witness.stats[iteration - 1]
+            assert np.array_equal(stats.mean, live.mean)
+            assert np.array_equal(stats.var, live.var)
+            assert stats.count == live.count
+    counts = run["obs_norm/count"][:]
+    assert (np.diff(counts)[run["index/phase"][1:] == 0] > 200).all()
+
+
+def test_a_run_without_normaliser_says_so(tmp_path: Path) -> None:
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr")
+    learn(CONFIGS["none"], callback)
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert run.info.obs_norm is None
+    assert run.obs_norm(0) is None
+    assert run.ret_norm(0) is None
+
+
+def test_the_papers_cadence(full_run: wt.Run) -> None:
+    assert len(full_run) == 3 * 5 + 1
+    assert full_run.phase.tolist() == [-1, *([0, 1, 2, 3, 4] * 3)]
+    assert full_run.iteration.tolist() == [0, *[1] * 5, *[2] * 5, *[3] * 5]
+    assert full_run["index/gradient_step"][:].tolist() == list(range(0, 961, 64))
+    assert full_run["index/epoch"][:].tolist() == [0, *([2, 4, 6, 8, 10] * 3)]
+    assert full_run.num_timesteps.tolist() == [0, *[2048] * 5, *[4096] * 5, *[6144] * 5]
+    assert full_run.layout.size == 122
+
+
+def test_the_learning_rate_is_annealed_as_cleanrls(full_run: wt.Run) -> None:
+    rates = full_run.learning_rate
+    assert np.isnan(rates[0])
+    expected = np.repeat([3e-4, 2e-4, 1e-4], 5)  # frac = 1 - (iteration - 1) / iterations
+    np.testing.assert_allclose(rates[1:], expected, rtol=1e-12)
+
+
+def test_diagnostics_stand_beside_the_last_snapshot_of_their_update(full_run: wt.Run) -> None:
+    last = full_run.phase == 4
+    for name in ("approx_kl", "clip_fraction", "value_loss", "explained_variance"):
+        values = full_run[f"train/{name}"][:]
+        assert np.isfinite(values[last]).all(), name
+        assert np.isnan(values[~last]).all(), name
+    returns = full_run["train/ep_rew_mean"][:]
+    assert np.isnan(returns[0])
+    assert (returns[1:] > 1).all()
+
+
+def test_moments_and_critic_are_stored_when_asked_for(full_run: wt.Run) -> None:
+    assert full_run["optimizer/exp_avg"][0].any() == np.False_
+    assert full_run["optimizer/exp_avg_sq"][1].min() > 0
+    critic = full_run.info.critic_layout
+    assert critic is not None
+    assert critic.size == full_run["critic/weights"].shape[1] == 4 * 64 + 64 + 64 * 64 + 64 + 64 + 1
+    assert not np.array_equal(full_run["critic/weights"][0], full_run["critic/weights"][-1])
+
+
+def test_probe_observations_are_network_inputs_of_each_rollout(full_run: wt.Run) -> None:
+    probes = full_run["probe/observations"][:]
+    assert probes.shape == (3, 64, 4)
+    assert np.abs(probes).max() <= 10
+    assert 0.3 < probes[1:].std() < 3
+
+
+def test_the_record_says_what_made_it(full_run: wt.Run) -> None:
+    info = full_run.info
+    assert info.algorithm is not None
+    assert info.env is not None
+    assert (info.algorithm.name, info.env.id, info.seed) == ("PPO", "InvertedPendulum-v4", 1)
+    assert info.algorithm.hyperparameters["n_steps"] == 2048
+    assert info.provenance.threads == 1
+    assert {"torch", "mujoco", "gymnasium", "stable-baselines3"} <= info.provenance.packages.keys()
+    assert [s.role for s in info.layout.params][:3] == ["log_std", "weight", "bias"]
+    assert info.layout["mlp_extractor.policy_net.2.weight"].axes == ("hidden_1", "hidden_0")
+    assert wt.verify(full_run.path) == []
+
+
+@pytest.mark.parametrize(("every", "steps"), [(5, [0, 5, 10, 15, 20, 25, 30, 32]), (64, [0, 32])])
+def test_the_last_weights_are_stored_exactly_once(
+    every: int, steps: list[int], tmp_path: Path
+) -> None:
+    model = learn(SMALL, WeightTrajectoryCallback(tmp_path / "run.zarr", every=every))
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert run["index/gradient_step"][:].tolist() == steps
+    assert np.array_equal(run.weights[-1], flat(model))
+
+
+def test_a2c_is_collected(tmp_path: Path) -> None:
+    model = A2C("MlpPolicy", "Pendulum-v1", n_steps=5, seed=0, device="cpu")
+    model.learn(50, callback=WeightTrajectoryCallback(tmp_path / "run.zarr", every=2))
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert run["index/gradient_step"][:].tolist() == [0, 2, 4, 6, 8, 10]
+    assert np.isfinite(run["train/policy_loss"][1:]).all()
+    assert np.array_equal(run.weights[-1], flat(model))
+    observation = np.array([0.1, 0.2, 0.3], np.float32)
+    expected = model.predict(observation, deterministic=True)[0]
+    assert np.array_equal(run.load_policy().predict(observation, deterministic=True)[0], expected)
+
+
+def test_cleanrls_clipping_lambda_is_understood(tmp_path: Path) -> None:
+    def env() -> gym.Env[Any, Any]:
+        env: gym.Env[Any, Any] = gym.make("InvertedPendulum-v4")
+        env = gym.wrappers.NormalizeObservation(env)
+        space = env.observation_space
+        return gym.wrappers.TransformObservation(env, lambda o: np.clip(o, -10, 10), space)
+
+    model = PPO("MlpPolicy", DummyVecEnv([env]), n_steps=64, device="cpu")
+    model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    norm = wt.open_run(tmp_path / "run.zarr").info.obs_norm
+    assert norm is not None
+    assert (norm.clip_low, norm.clip_high) == (-10, 10)
+
+
+# Policies that are recorded but not rebuilt
+
+
+class Extractor(BaseFeaturesExtractor):
+    def __init__(self, space: gym.Space[Any]) -> None:
+        super().__init__(space, features_dim=5)
+        self.linear = torch.nn.Linear(space.shape[0], 5)  # type: ignore[index]
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return self.linear(observations)  # type: ignore[no-any-return]
+
+
+def scaled_env() -> gym.Env[Any, Any]:
+    env = gym.make("Pendulum-v1")
+    return gym.wrappers.TransformObservation(env, lambda o: 2 * o, env.observation_space)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (
+            lambda: PPO(
+                "MlpPolicy",
+                "Pendulum-v1",
+                n_steps=64,
+                policy_kwargs={"features_extractor_class": Extractor},
+                device="cpu",
+            ),
+            "features from Extractor",
+        ),
+        (
+            lambda: PPO("MlpPolicy", DummyVecEnv([scaled_env]), n_steps=64, device="cpu"),
+            "environment wrapper TransformObservation",
+        ),
+        (
+            lambda: PPO(
+                "MlpPolicy",
+                VecFrameStack(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), 2),
+                n_steps=64,
+                device="cpu",
+            ),
+            "environment wrapper VecFrameStack",
+        ),
+        (
+            lambda: PPO("MlpPolicy", "Pendulum-v1", n_steps=64, use_sde=True, device="cpu"),
+            "state-dependent exploration",
+        ),
+    ],
+)
+def test_other_policies_are_recorded_all_the_same(
+    make: Callable[[], PPO], reason: str, tmp_path: Path
+) -> None:
+    model = make()
+    model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr", every=4))
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert np.array_equal(run.weights[-1], flat(model))
+    with pytest.raises(PolicyError, match=reason):
+        run.load_policy()
+
+
+# Bad input
+
+
+def test_several_optimizers_are_refused(tmp_path: Path) -> None:
+    model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=100, device="cpu")
+    with pytest.raises(CollectError, match=r"actor\.optimizer.*critic\.optimizer"):
+        model.learn(10, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    assert not (tmp_path / "run.zarr").exists()
+
+
+def test_an_existing_path_is_refused_before_training(tmp_path: Path) -> None:
+    (tmp_path / "run.zarr").mkdir()
+    model = make_ppo(SMALL, seed=0)
+    with pytest.raises(StoreExistsError, match="choose another path"):
+        model.learn(1024, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    assert model.num_timesteps == 0
+
+
+def test_diverged_training_stops_and_keeps_what_was_finite(tmp_path: Path) -> None:
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=1)
+    config = replace(SMALL, normalization="none")
+    model = make_ppo(config, seed=0)
+
+    def poison(*_: object) -> None:
+        if callback._step == 5:
+            with torch.no_grad():
+                model.policy.action_net.weight.fill_(float("nan"))
+
+    model.policy.optimizer.register_step_post_hook(poison)
+    with pytest.raises(SnapshotError, match="training has diverged"):
+        model.learn(1024, callback=callback)
+    callback.close()
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert (len(run), run.info.status) == (6, "crashed")
+    assert wt.verify(run.path) == []
+
+
+def test_an_interrupted_training_is_committed_when_the_callback_goes(tmp_path: Path) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 600:
+                raise KeyboardInterrupt
+            return True
+
+    model = make_ppo(SMALL, seed=0)
+    callbacks = [WeightTrajectoryCallback(tmp_path / "run.zarr", every=4), Stop()]
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(1024, callback=callbacks)
+    del model, callbacks
+    gc.collect()
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert (len(run), run.info.status) == (5, "crashed")
+
+
+def test_a_callback_records_one_training(tmp_path: Path) -> None:
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr")
+    with pytest.raises(CollectError, match="before training"):
+        _ = callback.writer
+    learn(SMALL, callback)
+    with pytest.raises(CollectError, match="second call"):
+        learn(SMALL, callback)
+
+
+@pytest.mark.parametrize("every", [0, -1])
+def test_an_impossible_cadence_is_refused(every: int, tmp_path: Path) -> None:
+    with pytest.raises(CollectError, match="at least 1"):
+        WeightTrajectoryCallback(tmp_path / "run.zarr", every=every)
+
+
+def normalized() -> gym.Env[Any, Any]:
+    return gym.wrappers.NormalizeObservation(gym.make("Pendulum-v1"))
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (lambda: DummyVecEnv([normalized, normalized]), "n_envs=1, or normalise with VecNormalize"),
+        (lambda: VecNormalize(DummyVecEnv([normalized])), "one on top of the other"),
+        (lambda: SubprocVecEnv([normalized], "fork"), "live in other processes"),
+    ],
+)
+def test_ambiguous_normalisers_are_refused(
+    env: Callable[[], Any], message: str, tmp_path: Path
+) -> None:
+    model = PPO("MlpPolicy", env(), n_steps=64, device="cpu")
+    with pytest.raises(CollectError, match=message):
+        model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    model.get_env().close()  # type: ignore[union-attr]

@@ -1,0 +1,47 @@
+"""Real short trainings, shared by the tests of a process; shapes and types are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+import tests.typecheck  # noqa: F401  the hook looks for it among the loaded modules
+
+install_import_hook(["weighttraj", "tipl"], "tests.typecheck.typecheck")
+
+import torch  # noqa: E402
+
+import weighttraj as wt  # noqa: E402
+from tests.small import SMALL_RECIPE  # noqa: E402
+from weighttraj.collect import PPOConfig, WeightTrajectoryCallback, collect, make_ppo  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Bit-equality holds at a fixed thread count only."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def full_run(tmp_path_factory: pytest.TempPathFactory) -> wt.Run:
+    """Three iterations of CleanRL's PPO at the paper's cadence, everything stored."""
+    torch.set_num_threads(1)
+    path = tmp_path_factory.mktemp("full") / "run.zarr"
+    config = PPOConfig(total_timesteps=3 * 2048)
+    callback = WeightTrajectoryCallback(path, critic=True, optimizer_moments=True)
+    make_ppo(config, seed=1).learn(config.total_timesteps, callback=callback)
+    return wt.open_run(path)
+
+
+@pytest.fixture(scope="session")
+def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two training runs and two test runs of 49 snapshots. Do not write to it."""
+    path = tmp_path_factory.mktemp("small") / "dataset"
+    collect(SMALL_RECIPE, path)
+    return path
