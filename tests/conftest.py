@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from jaxtyping import install_import_hook
 
 import tests.typecheck  # noqa: F401  the hook looks for it among the loaded modules
@@ -42,6 +44,9 @@ def full_run(tmp_path_factory: pytest.TempPathFactory) -> wt.Run:
 @pytest.fixture(scope="session")
 def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two training runs and two test runs of 49 snapshots. Do not write to it."""
-    path = tmp_path_factory.mktemp("small") / "dataset"
-    collect(SMALL_RECIPE, path)
-    return path
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # one for all worker processes
+        root = root.parent
+    with FileLock(root / "small.lock"):
+        collect(SMALL_RECIPE, root / "small")
+    return root / "small"

@@ -18,7 +18,7 @@ from weighttraj.collect.recipe import Seeds, Store
 SMALL = PPOConfig(total_timesteps=1024, n_steps=256, n_epochs=2, critic_arch=(8, 8))
 SMALL_RECIPE = Recipe(
     id="small",
-    ppo=replace(SMALL, total_timesteps=3072),
+    ppo=replace(SMALL, total_timesteps=768, n_steps=64, batch_size=16),
     seeds=Seeds(train=[0, 1], test=[2, 3]),
     store=Store(every=2, block=8, probe_observations=4),
 )

@@ -70,21 +70,27 @@ def collect(
     console = console or Console(quiet=True)
     info = _prepare(recipe, out, seeds)
     wanted = set(recipe.splits() if seeds is None else seeds)
-    tasks = []
+    tasks: list[Task] = []
+    failures: list[tuple[Task, Exception]] = []
     for entry in info.runs:
         if entry.seed not in wanted:
             continue
-        state = _state(out / entry.path)
+        task = Task(recipe=recipe, seed=entry.seed, path=out / entry.path)
+        try:
+            state = _state(task.path)
+        except WeightTrajError as error:
+            failures.append((task, error))
+            continue
         console.print(f"seed {entry.seed}: {state}")
         if not state.startswith("complete"):
-            tasks.append(Task(recipe=recipe, seed=entry.seed, path=out / entry.path))
-    failures = _run(tasks, workers, console)
+            tasks.append(task)
+    failures += _run(tasks, workers, console)
     again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
     failures = [f for f in failures if not isinstance(f[1], ReplayError)]
     failures += _run(again, workers, console)
     if failures:
         raise CollectError(
-            f"{len(failures)} of {len(tasks)} runs failed; the others are whole",
+            f"{len(failures)} of {len(wanted)} runs failed; the others are whole",
             got="\n".join(f"seed {task.seed}: {error}" for task, error in failures),
             where=out,
             do="mend the cause and give the same command again: it goes on where it stopped",
@@ -130,7 +136,7 @@ class _ProgressCallback(BaseCallback):
 
 def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     """Write ``dataset.json`` with every run that will be there."""
-    document = msgspec.to_builtins(recipe) | {"seeds": recipe.seeds.by_split()}
+    document = json.loads(msgspec.json.encode(recipe)) | {"seeds": recipe.seeds.by_split()}
     info = DatasetInfo(
         id=recipe.id, version=recipe.version, licence=recipe.licence, recipe=document
     )

@@ -1,0 +1,218 @@
+"""Recipes to data sets, and on again after being killed."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import weighttraj as wt
+from tests.small import SMALL, SMALL_RECIPE
+from weighttraj.collect import Recipe, collect, read_recipe
+from weighttraj.collect.recipe import Seeds, parse_seeds
+from weighttraj.errors import CollectError, RecipeError
+
+TOML = """
+id = "small"
+[ppo]
+total_timesteps = 768
+n_steps = 64
+batch_size = 16
+n_epochs = 2
+critic_arch = [8, 8]
+[seeds]
+train = "0:2"
+test = [2, 3]
+[store]
+every = 2
+block = 8
+probe_observations = 4
+"""
+
+
+@pytest.fixture
+def recipe_file(tmp_path: Path) -> Path:
+    path = tmp_path / "recipe.toml"
+    path.write_text(TOML)
+    return path
+
+
+def test_a_recipe_is_read(recipe_file: Path) -> None:
+    recipe = read_recipe(recipe_file)
+    assert recipe.splits() == SMALL_RECIPE.splits()
+    assert replace(recipe, seeds=SMALL_RECIPE.seeds) == SMALL_RECIPE
+
+
+@pytest.mark.parametrize("path", sorted(Path("datasets").glob("*/recipe.toml")))
+def test_our_recipes_can_be_read(path: Path) -> None:
+    assert read_recipe(path).splits()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("n_steps", "n_stpes"), "did you mean 'n_steps'"),
+        (("[store]", "[stores]"), "did you mean 'store'"),
+        (('id = "small"', ""), "missing required field `id`"),
+        (("every = 2", 'every = "2"'), r"Expected `int`, got `str` - at `\$\.store\.every`"),
+        (("[2, 3]", "[1, 3]"), "seed 1 in train and in test"),
+        (('"0:2"', '"0-2"'), 'a range such as "0:30"'),
+        (("id =", "id = ="), "no TOML"),
+    ],
+)
+def test_a_bad_recipe_is_one_clear_error(
+    recipe_file: Path, change: tuple[str, str], message: str
+) -> None:
+    recipe_file.write_text(TOML.replace(*change))
+    with pytest.raises(RecipeError, match=message):
+        read_recipe(recipe_file)
+
+
+def test_seeds() -> None:
+    assert parse_seeds("7") == [7]
+    assert parse_seeds([5, 2]) == [5, 2]
+    with pytest.raises(RecipeError):
+        parse_seeds([-1])
+
+
+def test_a_data_set_is_collected(small_dataset: Path) -> None:
+    dataset = wt.open(small_dataset)
+    assert dataset.info.status == "complete"
+    assert [run.id for run in dataset] == ["seed0000", "seed0001", "seed0002", "seed0003"]
+    assert all(len(run) == 12 * 4 + 1 for run in dataset)
+    assert wt.verify(small_dataset) == []
+    assert not np.array_equal(dataset.runs[0].weights[-1], dataset.runs[1].weights[-1])
+
+
+def one_seed(seed: int = 0) -> Recipe:
+    return replace(SMALL_RECIPE, seeds=Seeds(train=[seed]))
+
+
+def test_processes_give_the_same_bytes(small_dataset: Path, tmp_path: Path) -> None:
+    recipe = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1]))
+    dataset = collect(recipe, tmp_path / "dataset", workers=2)
+    for run, same in zip(dataset, wt.open(small_dataset), strict=False):
+        assert np.array_equal(run["digest"][:], same["digest"][:])
+        assert np.array_equal(run["obs_norm/mean"][:], same["obs_norm/mean"][:])
+
+
+def test_collecting_again_does_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "dataset"
+    collect(one_seed(), out)
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("c/*")}
+    screen = io.StringIO()
+    collect(one_seed(), out, console=Console(file=screen))
+    assert "seed 0: complete, 49 snapshots" in screen.getvalue()
+    assert before == {p: p.stat().st_mtime_ns for p in out.rglob("c/*")}
+
+
+def test_seeds_can_be_added(tmp_path: Path) -> None:
+    out = tmp_path / "dataset"
+    collect(one_seed(), out)
+    dataset = collect(one_seed(), out, seeds=[7])
+    assert [(run.info.seed, run.split) for run in dataset] == [(0, "train"), (7, "")]
+
+
+def test_a_killed_collector_goes_on_where_it_was(
+    small_dataset: Path, recipe_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "dataset"
+    command = [sys.executable, "-m", "weighttraj.cli", "collect", str(recipe_file)]
+    command += ["--out", str(out), "--seeds", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    path = out / "runs/seed0000.zarr"
+    committed = 0
+    deadline = time.monotonic() + 120
+    while committed < 16 and process.poll() is None and time.monotonic() < deadline:
+        if (path / "zarr.json").exists():
+            committed = json.loads((path / "zarr.json").read_text())["attributes"]["weighttraj"][
+                "n_committed"
+            ]
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    run = wt.open_run(path)
+    whole = wt.open(small_dataset).runs[0]
+    assert 16 <= committed <= len(run) < 49
+    assert wt.verify(path) == []
+    assert np.array_equal(run.weights[:], whole.weights[: len(run)])
+
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    said = " ".join(again.stdout.split())
+    assert f"interrupted after {len(run)} committed snapshots" in said
+    assert "continuing after the last" in said
+    run = wt.open_run(path)
+    assert run.info.status == "complete"
+    for name in whole.arrays:
+        assert np.array_equal(run[name][:], whole[name][:], equal_nan=True), name
+    assert wt.verify(path) == []
+
+
+def test_a_run_that_does_not_repeat_itself_starts_over(small_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "dataset"
+    info = wt.open(small_dataset).runs[0].info
+    size = info.layout.size
+    with (
+        pytest.raises(ZeroDivisionError),
+        wt.RunWriter(out / "runs/seed0000.zarr", info) as writer,
+    ):
+        for _ in range(3):  # another machine's numbers
+            writer.append(
+                np.ones(size, np.float32),
+                num_timesteps=0,
+                obs_norm=(np.zeros(4), np.ones(4), 1.0),
+                ret_norm=(np.array(0.0), np.array(1.0), 1.0),
+            )
+        raise ZeroDivisionError
+    entry = {"id": "seed0000", "path": "runs/seed0000.zarr", "seed": 0, "split": "train"}
+    recipe = json.loads((small_dataset / "dataset.json").read_text())
+    (out / "dataset.json").write_text(json.dumps(recipe | {"runs": [entry]}))
+    screen = io.StringIO()
+    dataset = collect(one_seed(), out, console=Console(file=screen, width=1000))
+    assert "does not repeat its committed snapshots" in screen.getvalue()
+    assert "starting over as seed0000-2" in screen.getvalue()
+    assert [(run.id, len(run)) for run in dataset] == [("seed0000-2", 49)]
+    assert len(wt.open_run(out / "runs/seed0000.zarr")) == 3
+
+
+def test_another_recipe_does_not_touch_a_data_set(small_dataset: Path) -> None:
+    other = replace(SMALL_RECIPE, ppo=replace(SMALL, gamma=0.9))
+    with pytest.raises(CollectError, match="another recipe"):
+        collect(other, small_dataset)
+
+
+def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(CollectError, match=r"thesis\.tex"):
+        collect(one_seed(), tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_failing_run_leaves_the_others_whole(tmp_path: Path, workers: int) -> None:
+    out = tmp_path / "dataset"
+    recipe = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1, 2]))
+    collect(replace(recipe, seeds=Seeds(train=[0])), out)
+    (out / "runs/seed0001.zarr").mkdir()
+    (out / "runs/seed0001.zarr/zarr.json").write_text('{"attributes": {}}')
+    with pytest.raises(CollectError, match=r"(?s)1 of 3 runs failed.*seed 1.*run of weighttraj"):
+        collect(recipe, out, workers=workers)
+    assert wt.open_run(out / "runs/seed0002.zarr").info.status == "complete"
+    assert wt.open_run(out / "runs/seed0000.zarr").info.status == "complete"
+
+
+def test_an_unknown_environment_fails_each_run_clearly(tmp_path: Path) -> None:
+    recipe = replace(one_seed(), ppo=replace(SMALL, env_id="NoSuchEnv-v0"))
+    with pytest.raises(CollectError, match=r"(?s)seed 0: the environment cannot be made.*goes on"):
+        collect(recipe, tmp_path / "dataset", workers=1)
