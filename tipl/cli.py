@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -51,13 +52,29 @@ def _evaluate(config: _Evaluate) -> None:
     print(f"report: {config.out / 'report.html'}")
 
 
+@app.command(name="report")
+def _report(
+    results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a results.json")],
+    into: Annotated[
+        Path | None, tyro.conf.arg(help="rewrite the results' table in this Markdown page")
+    ] = None,
+) -> None:
+    """Write the page and figures of a result file again, or its table into a Markdown page."""
+    document = json.loads(results.read_text())
+    if into is not None:
+        report.insert_markdown(document, results, into)
+        print(f"table in {into}")
+    else:
+        print(f"report: {report.write_report(document, results.parent)}")
+
+
 def _table(results: dict[str, Any]) -> Table:
     modes = results["modes"]
     table = Table(title=f"{results['data']}, unseen runs: {', '.join(results['runs'])}")
     for column in ("forecaster", "h", "WPE", "skill", *(f"REPW {mode}" for mode in modes)):
         table.add_column(column, justify="left" if column == "forecaster" else "right")
     for row in report.table(results):
-        if row["h"] in (1, 2, 5, 10):
+        if row["h"] in report.SHOWN_HORIZONS:
             interval = "" if row["low"] is None else f" [{row['low']:.3g}, {row['high']:.3g}]"
             cells = [f"{row['wpe']:.3g}", f"{row['value']:.3g}{interval}"]
             cells += [f"{row['repw'][mode]:.1f}" for mode in modes]

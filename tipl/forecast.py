@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -28,6 +28,7 @@ from tipl.tokens import history
 from weighttraj import Run
 
 
+@runtime_checkable
 class Forecaster(Protocol):
     """Forecasts the weights of a policy some snapshots ahead."""
 

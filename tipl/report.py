@@ -11,11 +11,14 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tipl.errors import EvaluateError
+
 LABELS = {
     "tipl": "TIPL",
-    "persistence": "copy of the last weights",
-    "reconstruction": "reconstruction floor",
+    "persistence": "copy",
+    "reconstruction": "rank floor",
 }
+SHOWN_HORIZONS = (1, 2, 5, 10)
 COLORS = {"tipl": "#c0392b", "persistence": "#2c3e50", "reconstruction": "#7f8c8d"}
 
 
@@ -63,6 +66,41 @@ def table(results: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def markdown(results: dict[str, Any]) -> str:
+    """Table and verdict as Markdown: what README shows of a result file."""
+    modes = results["modes"]
+    head = ["forecaster", "h", "WPE", "skill", *(f"REPW, {mode}" for mode in modes)]
+    lines = [" | ".join(head), " | ".join(["---"] + ["---:"] * (len(head) - 1))]
+    for row in table(results):
+        if row["h"] in SHOWN_HORIZONS:
+            cells = [label(row["name"]), str(row["h"]), f"{row['wpe']:.3g}", f"{row['value']:.3g}"]
+            cells += [f"{row['repw'][mode]:.1f}" for mode in modes]
+            lines.append(" | ".join(cells))
+    return "\n".join([f"| {line} |" for line in lines] + ["", verdict(results)])
+
+
+def insert_markdown(results: dict[str, Any], source: Path, page: Path) -> None:
+    """Replace what stands between the markers of a result file in a Markdown page.
+
+    The markers are comments that begin with ``results of <source>`` and ``end of results``.
+
+    Raises:
+        EvaluateError: the page has no such markers.
+    """
+    text = page.read_text()
+    before, start, rest = text.partition(f"<!-- results of {source}")
+    marker_end, close, rest = rest.partition("-->\n")
+    _, end, after = rest.partition("<!-- end of results -->")
+    if not (start and close and end):
+        raise EvaluateError(
+            "the page has no place for these results",
+            expected=f"<!-- results of {source} --> and <!-- end of results -->, a line each",
+            where=page,
+            do="write both lines where the table shall stand",
+        )
+    page.write_text(f"{before}{start}{marker_end}{close}\n{markdown(results)}\n\n{end}{after}")
+
+
 def figure(results: dict[str, Any], mode: str) -> Figure:
     """The paper's figure, with what it leaves out: the copy and the floor.
 
@@ -81,15 +119,16 @@ def figure(results: dict[str, Any], mode: str) -> Figure:
             scatter.plot(true, forecast, "o", ms=3, alpha=0.5, color=COLORS.get(name))
     if mode in results["noise_floor"]:
         floor = results["noise_floor"][mode]
-        repw.axhline(floor, ls=":", color="black", label="noise floor: same policy, new episodes")
+        repw.axhline(floor, ls=":", color="black")
+        text = "noise floor: true policy, other episodes"
+        repw.annotate(text, (0.02, floor), xycoords=("axes fraction", "data"), va="bottom", size=7)
     _style(wpe, "forecast step h", "WPE: mean squared error of weights")
     wpe.set_yscale("log")
     _style(repw, "forecast step h", f"REPW: |J(true) - J(forecast)|, {mode}")
     repw.set_ylim(bottom=0)
     _style(scatter, "J(true policy)", "J(forecast policy)")
     scatter.axline((0, 0), slope=1, ls=":", color="black")
-    for axes in (wpe, repw):
-        axes.legend(fontsize=7)
+    wpe.legend(fontsize=8)
     return fig
 
 

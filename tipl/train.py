@@ -100,6 +100,7 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
                 _save_state(config.out, model, optimizer, n + 1)
                 progress.update(bar, description=f"training, WPE {total / count:.3g}")
                 total, count = 0.0, 0
+    model.eval()
     forecaster.save(config.out)
     return forecaster
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +79,8 @@ def main() -> None:
     except (WeightTrajError, FileNotFoundError) as error:
         console.print(f"[red]error:[/red] {escape(str(error))}", style=None)
         sys.exit(1)
+    except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         console.print("stopped; give the same command again to go on")
         sys.exit(130)

@@ -354,7 +354,10 @@ def test_diverged_training_stops_and_keeps_what_was_finite(tmp_path: Path) -> No
     assert wt.verify(run.path) == []
 
 
-def test_an_interrupted_training_is_committed_when_the_callback_goes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("managed", [True, False])
+def test_an_interrupted_training_is_committed_when_the_callback_goes(
+    managed: bool, tmp_path: Path
+) -> None:
     class Stop(BaseCallback):
         def _on_step(self) -> bool:
             if self.num_timesteps == 600:
@@ -362,10 +365,14 @@ def test_an_interrupted_training_is_committed_when_the_callback_goes(tmp_path: P
             return True
 
     model = make_ppo(SMALL, seed=0)
-    callbacks = [WeightTrajectoryCallback(tmp_path / "run.zarr", every=4), Stop()]
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=4)
     with pytest.raises(KeyboardInterrupt):
-        model.learn(1024, callback=callbacks)
-    del model, callbacks
+        if managed:
+            with callback:
+                model.learn(1024, callback=[callback, Stop()])
+        else:
+            model.learn(1024, callback=[callback, Stop()])
+    del model, callback
     gc.collect()
     run = wt.open_run(tmp_path / "run.zarr")
     assert (len(run), run.info.status) == (5, "crashed")

@@ -56,8 +56,9 @@ class WeightTrajectoryCallback(BaseCallback):
         StoreExistsError: (when training starts) the path exists.
         SnapshotError: (while training) the weights are not finite.
 
-    If training ends by an exception, call ``close()`` to commit the last snapshots and mark the run
-    ``crashed``; without it this happens when the interpreter exits.
+    SB3 tells callbacks nothing when training ends by an exception. Used as a context manager around
+    ``learn``, the callback then commits the last snapshots and marks the run ``crashed``; otherwise
+    the block that was being filled is lost, as if the process had been killed.
     """
 
     def __init__(
@@ -112,6 +113,12 @@ class WeightTrajectoryCallback(BaseCallback):
             self._hook.remove()
             self._writer.close(status)
 
+    def __enter__(self) -> WeightTrajectoryCallback:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _on_training_start(self) -> None:
         self._algorithm = model = check_model(self.model)
         if self._writer is not None:
@@ -130,7 +137,8 @@ class WeightTrajectoryCallback(BaseCallback):
         self._ep_rew_mean = float("nan")
         self._writer = RunWriter(self.path, info, resume=self.resume)
         self._hook = model.policy.optimizer.register_step_post_hook(self._on_gradient_step)
-        weakref.finalize(self, self._writer.close, "crashed")
+        # For notebooks. Not at exit: Zarr's threads are gone by then.
+        weakref.finalize(self, self._writer.close, "crashed").atexit = False
         self._snapshot()
 
     def _describe(self, model: OnPolicyAlgorithm, norm: Normalizers) -> RunInfo:

@@ -142,11 +142,13 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     )
     if (out / "dataset.json").exists():
         old = read_dataset_info(out)
-        if {**old.recipe, "seeds": None} != {**document, "seeds": None}:
+        before, now = (_flat({**d, "seeds": None}) for d in (old.recipe, document))
+        other = sorted(k for k in before | now if before.get(k) != now.get(k))
+        if other:
             raise CollectError(
                 "the folder holds a data set of another recipe",
-                expected=old.recipe,
-                got=document,
+                expected={key: before.get(key) for key in other},
+                got={key: now.get(key) for key in other},
                 where=out,
                 do="choose another folder with --out",
             )

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
+from numpy.typing import ArrayLike
 
 from weighttraj.errors import FormatError, SnapshotError
 
@@ -107,7 +108,7 @@ class ParamLayout:
                 return spec
         raise KeyError(f"no parameter {name!r}; there are {[s.name for s in self.params]}")
 
-    def flatten(self, tensors: Mapping[str, np.ndarray]) -> Float32[np.ndarray, " param"]:
+    def flatten(self, tensors: Mapping[str, ArrayLike]) -> Float32[np.ndarray, " param"]:
         """Join named tensors into one float32 vector.
 
         Raises:

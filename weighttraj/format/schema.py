@@ -84,9 +84,9 @@ class EnvInfo:
     kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments for ``gymnasium.make``."""
     max_episode_steps: int | None = None
-    """Time limit in steps, exclusive of nothing: an episode has at most this many."""
+    """Time limit: an episode has at most this many steps."""
     spec: dict[str, Any] = field(default_factory=dict)
-    """``EnvSpec.to_json()`` of the unwrapped environment, for the record."""
+    """What else the registry says of it, for the record; nothing is rebuilt from it."""
     wrappers: tuple[str, ...] = ()
     """Class names of the wrappers, outermost first."""
 

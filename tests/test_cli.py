@@ -1,0 +1,75 @@
+"""The commands as a shell sees them: exit codes, and errors without a traceback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import weighttraj as wt
+
+
+def run(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", f"{program}.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("weighttraj", "--help"),
+        ("weighttraj", "collect", "--help"),
+        ("tipl", "train", "--help"),
+        ("tipl", "evaluate", "--help"),
+    ],
+)
+def test_help_teaches(arguments: tuple[str, ...]) -> None:
+    done = run(*arguments)
+    assert done.returncode == 0
+    assert "usage" in done.stdout
+    assert len(done.stdout) > 300
+
+
+def test_show_and_verify(small_dataset: Path) -> None:
+    assert "4 runs" in run("weighttraj", "show", small_dataset).stdout
+    shown = run("weighttraj", "show", small_dataset / "runs/seed0000.zarr").stdout
+    assert "<policy/weights float32 {'time': 49, 'param': 122}>" in shown
+    done = run("weighttraj", "verify", small_dataset)
+    assert (done.returncode, done.stdout.strip()) == (0, f"{small_dataset}: whole")
+
+
+def test_verify_fails_on_damage(tmp_path: Path) -> None:
+    layout = wt.ParamLayout.of({"w": ((3,), "other", ("fixed",))})
+    with wt.RunWriter(tmp_path / "r.zarr", wt.RunInfo(run_id="r", layout=layout)) as writer:
+        writer.append(layout.flatten({"w": [1, 2, 3]}), num_timesteps=0)
+    (tmp_path / "r.zarr/policy/weights/c/0/0").unlink()
+    done = run("weighttraj", "verify", tmp_path / "r.zarr")
+    assert done.returncode == 1
+    assert "expected: the object policy/weights/c/0/0" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("weighttraj", "show", "nowhere"), "no run at nowhere"),
+        (("weighttraj", "collect", "nowhere.toml"), "nowhere.toml"),
+        (("tipl", "train", "--data", "nowhere", "--out", "x"), "no data set at nowhere"),
+    ],
+)
+def test_errors_are_one_message(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run(*arguments)
+    assert done.returncode == 1
+    assert message in done.stdout + done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_misspelt_option_is_answered_with_the_right_one() -> None:
+    done = run("tipl", "train", "--data", "a", "--out", "b", "--n-batchs", "3")
+    assert done.returncode == 2
+    assert "--n-batches" in done.stdout + done.stderr

@@ -1,0 +1,188 @@
+"""The arrows between rooms, and what importing costs."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# Each module, and what of ours it may import. A package stands for all in it, `door` for what the
+# package itself names. `later`: inside a function, which opens another room when it is called.
+FORMAT = "weighttraj.format"
+ALLOWED = {
+    "weighttraj.errors": [],
+    "weighttraj.format.layout": ["weighttraj.errors"],
+    "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
+    "weighttraj.format.storage": ["weighttraj.errors", "weighttraj.format.schema"],
+    "weighttraj.format.writer": [
+        "weighttraj.errors",
+        "weighttraj.format.schema",
+        "weighttraj.format.storage",
+    ],
+    "weighttraj.format.reader": [
+        "weighttraj.errors",
+        "weighttraj.format.layout",
+        "weighttraj.format.schema",
+        "weighttraj.format.storage",
+        "later weighttraj.load.windows",
+        "later weighttraj.policies.policy",
+    ],
+    "weighttraj.format.integrity": ["weighttraj.errors", "weighttraj.format.reader"],
+    "weighttraj.format": [FORMAT],
+    "weighttraj.environments": ["weighttraj.errors"],
+    "weighttraj.collect": [
+        "weighttraj.errors",
+        "weighttraj.environments",
+        FORMAT,
+        "weighttraj.collect",
+    ],
+    "weighttraj.policies": [
+        "weighttraj.errors",
+        "weighttraj.environments",
+        FORMAT,
+        "weighttraj.policies",
+    ],
+    "weighttraj.load": ["weighttraj.errors", FORMAT, "weighttraj.load"],
+    "weighttraj.cli": ["door weighttraj", "weighttraj.errors", "later weighttraj.collect.recipe"],
+    "weighttraj": [FORMAT],
+    "tipl.errors": ["weighttraj.errors"],
+    "tipl.representation": ["tipl.errors"],
+    "tipl.models": ["tipl.models"],
+    "tipl.tokens": ["tipl.errors", "tipl.representation"],
+    "tipl.forecast": [
+        "tipl.errors",
+        "tipl.models",
+        "tipl.representation",
+        "tipl.tokens",
+        "door weighttraj",
+    ],
+    "tipl.baselines": ["tipl.representation", "door weighttraj"],
+    "tipl.train": [
+        "tipl.errors",
+        "tipl.forecast",
+        "tipl.models",
+        "tipl.representation",
+        "tipl.tokens",
+        "door weighttraj",
+    ],
+    "tipl.report": ["tipl.errors"],
+    "tipl.evaluate": [
+        "tipl.baselines",
+        "tipl.errors",
+        "tipl.forecast",
+        "tipl.report",
+        "door weighttraj",
+        "weighttraj.policies",
+    ],
+    "tipl.cli": ["tipl", "weighttraj.errors"],
+    "tipl": ["tipl", "weighttraj.errors"],
+}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def rule_of(module: str, rules: dict[str, list[str]]) -> list[str]:
+    while module not in rules:
+        module = module.rpartition(".")[0]
+    return rules[module]
+
+
+def imports(path: Path) -> set[str]:
+    """Modules of ours that a file imports; those inside functions are marked ``later``."""
+    tree = ast.parse(path.read_text())
+    found = set()
+    later = {
+        node
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef)
+        for node in ast.walk(function)
+    }
+    for node in ast.walk(tree):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            # `from package import module` names the module, not the package
+            paths = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [p if is_module(p) else node.module for p in paths]
+        typing_only = isinstance(node, ast.ImportFrom) and in_type_checking(tree, node)
+        mark = "later " if node in later or typing_only else ""
+        found |= {mark + n for n in names if n.split(".")[0] in ("weighttraj", "tipl")}
+    return found
+
+
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+
+
+def in_type_checking(tree: ast.Module, node: ast.AST) -> bool:
+    blocks = [n for n in tree.body if isinstance(n, ast.If)]
+    return any(node in ast.walk(b) for b in blocks if ast.unparse(b.test) == "TYPE_CHECKING")
+
+
+FILES = sorted([*ROOT.glob("weighttraj/**/*.py"), *ROOT.glob("tipl/**/*.py")])
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_arrows_go_one_way(path: Path) -> None:
+    allowed = rule_of(module_name(path), ALLOWED)
+    for name in imports(path):
+        inside = any(name == rule or name.startswith(f"{rule}.") for rule in allowed)
+        assert inside or f"door {name}" in allowed, f"{module_name(path)} imports {name}"
+
+
+def test_the_table_of_arrows_has_no_dead_lines() -> None:
+    names = {module_name(path) for path in FILES}
+    for module in ALLOWED:
+        assert module in names, module
+
+
+def run(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = "import sys, weighttraj; print([m for m in HEAVY if m in sys.modules])"
+    heavy = ["torch", "stable_baselines3", "gymnasium", "mujoco", "matplotlib", "pandas"]
+    assert run(f"HEAVY = {heavy}; {code}") == "[]"
+
+
+BLOCKED = """
+import sys
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == {missing!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Block())
+import weighttraj as wt
+try:
+    {use}
+except ImportError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("missing", "use", "extra"),
+    [
+        ("stable_baselines3", "wt.collect", "sb3"),
+        ("torch", "wt.policies", "sb3"),
+        ("torch", "wt.load", "sb3"),
+        ("safetensors", "import tipl", "tipl"),
+        ("jinja2", "import tipl", "tipl"),
+    ],
+)
+def test_a_missing_extra_names_the_command(missing: str, use: str, extra: str) -> None:
+    said = run(BLOCKED.format(missing=missing, use=use))
+    assert missing in said
+    assert f"pip install 'weighttraj[{extra}]'" in said

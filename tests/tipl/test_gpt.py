@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import torch
+
+from tipl.models.gpt import GPT, GPTConfig
+
+CONFIG = GPTConfig(rank=4, max_timestep=50, block_size=6, n_embd=16, n_head=2)
+
+
+def inputs(batch: int = 3) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    tokens = torch.randn(batch, 6, 4)
+    timesteps = torch.arange(10, 16).expand(batch, 6)
+    return tokens, timesteps, torch.ones(batch, 6, dtype=torch.bool)
+
+
+def model() -> GPT:
+    torch.manual_seed(1)
+    return GPT(CONFIG).eval()
+
+
+def test_later_tokens_do_not_move_earlier_outputs() -> None:
+    tokens, timesteps, mask = inputs()
+    before = model()(tokens, timesteps, mask)
+    tokens[:, 4:] += 1
+    after = model()(tokens, timesteps, mask)
+    assert torch.equal(before[:, :4], after[:, :4])
+    assert not torch.equal(before[:, 4:], after[:, 4:])
+
+
+def test_padding_is_not_seen() -> None:
+    tokens, timesteps, mask = inputs()
+    mask[:, :2] = False
+    before = model()(tokens, timesteps, mask)
+    tokens[:, :2] = 1e3
+    assert torch.equal(before[:, 2:], model()(tokens, timesteps, mask)[:, 2:])
+    short = model()(tokens[:, 2:], timesteps[:, 2:], mask[:, 2:])
+    torch.testing.assert_close(before[:, 2:], short)
+    assert torch.isfinite(before).all()
+
+
+def test_time_is_seen() -> None:
+    tokens, timesteps, mask = inputs()
+    assert not torch.equal(model()(tokens, timesteps, mask), model()(tokens, timesteps + 1, mask))
+
+
+def test_inputs_are_standardised_by_saved_buffers() -> None:
+    tokens, timesteps, mask = inputs()
+    network = model()
+    plain = network(tokens, timesteps, mask)
+    network.input_mean.fill_(2.0)
+    network.input_std.fill_(3.0)
+    torch.testing.assert_close(network(tokens * 3 + 2, timesteps, mask), plain)
+    assert {"input_mean", "input_std"} <= network.state_dict().keys()
+
+
+def test_sizes_are_decision_transformers() -> None:
+    network = GPT(GPTConfig(rank=32, max_timestep=1951))
+    assert sum(p.numel() for p in network.blocks.parameters()) == 3 * 198_272
+    assert (network.config.block_size, network.config.n_head, network.config.dropout) == (
+        20,
+        1,
+        0.1,
+    )

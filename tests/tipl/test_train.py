@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import weighttraj as wt
+from tipl import TIPL, TemporalSVD, TrainConfig, train
+from tipl.errors import ModelError, TrainError
+from weighttraj.errors import FormatError
+
+
+@pytest.fixture
+def config(small_dataset: Path, tmp_path: Path) -> TrainConfig:
+    return TrainConfig(
+        data=small_dataset,
+        out=tmp_path / "model",
+        rank=8,
+        n_batches=6,
+        batch_size=8,
+        warmup=3,
+        block_size=5,
+        n_layer=2,
+        n_embd=16,
+        save_every=3,
+    )
+
+
+def test_training_lowers_the_loss_and_writes_a_log(config: TrainConfig) -> None:
+    train(replace(config, n_batches=300, learning_rate=1e-2, save_every=100))
+    lines = [json.loads(s) for s in (config.out / "log.jsonl").read_text().splitlines()]
+    assert [line["batch"] for line in lines] == [100, 200, 300]
+    assert lines[-1]["wpe"] < 0.2 * lines[0]["wpe"]
+
+
+def test_an_interrupted_training_ends_as_an_undisturbed_one(
+    config: TrainConfig, tmp_path: Path
+) -> None:
+    whole = train(config).model.state_dict()
+    broken = replace(config, out=tmp_path / "broken")
+    train(replace(broken, n_batches=3))
+    again = train(broken).model.state_dict()
+    for name, tensor in whole.items():
+        assert torch.equal(tensor, again[name]), name
+
+
+def test_a_finished_training_is_loaded(config: TrainConfig) -> None:
+    first, second = train(config), train(config)
+    for a, b in zip(first.model.parameters(), second.model.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_seeds_matter(config: TrainConfig, tmp_path: Path) -> None:
+    one, two = train(config), train(replace(config, seed=1, out=tmp_path / "other"))
+    assert not torch.equal(one.model.head.weight, two.model.head.weight)
+
+
+def test_a_saved_model_forecasts_the_same(config: TrainConfig) -> None:
+    model, run = train(config), wt.open(config.data).split("test").runs[0]
+    again = TIPL.load(config.out)
+    assert again.config == model.config
+    expected = model.forecast(run, [0, 3, 30], [1, 2, 10])
+    assert expected.shape == (3, 3, 122)
+    assert expected.dtype == np.float32
+    assert np.array_equal(again.forecast(run, [0, 3, 30], [1, 2, 10]), expected)
+    assert {p.name for p in config.out.iterdir()} == {
+        "config.json",
+        "log.jsonl",
+        "model.safetensors",
+        "state.safetensors",
+        "train.json",
+    }
+
+
+def test_one_step_is_the_network_on_the_last_window(config: TrainConfig) -> None:
+    model, run = train(config), wt.open(config.data).split("test").runs[0]
+    weights = run.weights[:]
+    svd = TemporalSVD.fit(weights, 8)
+    tokens = torch.from_numpy(svd.transform(weights)[6:11].astype(np.float32))[None]
+    mask = torch.ones(1, 5, dtype=torch.bool)
+    with torch.no_grad():
+        u = model.model(tokens, torch.arange(6, 11)[None], mask)[0, -1]
+    expected = svd.inverse_transform(u.numpy())
+    np.testing.assert_allclose(model.forecast(run, [10], [1])[0, 0], expected, atol=1e-6)
+
+
+def test_starts_do_not_see_each_other(config: TrainConfig) -> None:
+    model, run = train(config), wt.open(config.data).split("test").runs[0]
+    alone = model.forecast(run, [20], [1, 5])
+    np.testing.assert_allclose(model.forecast(run, [2, 20], [1, 5])[1:], alone, atol=1e-6)
+
+
+def test_other_settings_are_not_mixed(config: TrainConfig) -> None:
+    train(config)
+    with pytest.raises(TrainError, match="'rank': 8"):
+        train(replace(config, rank=9))
+
+
+def test_a_data_set_without_training_runs_is_refused(config: TrainConfig, tmp_path: Path) -> None:
+    (tmp_path / "dataset").mkdir()
+    document = json.loads((config.data / "dataset.json").read_text())
+    document |= {"runs": [], "status": "collecting"}
+    (tmp_path / "dataset/dataset.json").write_text(json.dumps(document))
+    with pytest.raises(FormatError, match="no runs"):
+        train(replace(config, data=tmp_path / "dataset"))
+
+
+def test_a_loss_that_explodes_stops_the_training(config: TrainConfig) -> None:
+    with pytest.raises(TrainError, match="lower --learning-rate"):
+        train(replace(config, learning_rate=1e30, n_batches=50))
+
+
+def test_a_damaged_model_is_not_loaded(config: TrainConfig) -> None:
+    train(config)
+    text = (config.out / "config.json").read_text()
+    (config.out / "config.json").write_text(text.replace('"n_layer": 2', '"n_layer": 3'))
+    with pytest.raises(ModelError, match="Missing key"):
+        TIPL.load(config.out)
+    (config.out / "config.json").write_text(text)
+    file = config.out / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ModelError, match="cannot be loaded"):
+        TIPL.load(config.out)
+
+
+def test_runs_that_do_not_fit_the_model_are_refused(config: TrainConfig) -> None:
+    model, run = train(config), wt.open(config.data).split("test").runs[0]
+    with pytest.raises(ModelError, match="up to snapshot 49"):
+        model.forecast(run, [45], [10])
+    other = TIPL(model.model, replace(model.config, every=64))
+    with pytest.raises(ModelError, match="another cadence"):
+        other.forecast(run, [1], [1])
