@@ -9,11 +9,10 @@ import queue
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import msgspec
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -136,7 +135,7 @@ class _ProgressCallback(BaseCallback):
 
 def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     """Write ``dataset.json`` with every run that will be there."""
-    document = json.loads(msgspec.json.encode(recipe)) | {"seeds": recipe.seeds.by_split()}
+    document = json.loads(json.dumps(asdict(recipe))) | {"seeds": recipe.seeds.by_split()}
     info = DatasetInfo(
         id=recipe.id, version=recipe.version, licence=recipe.licence, recipe=document
     )
@@ -173,6 +172,15 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     out.mkdir(parents=True, exist_ok=True)
     _write_info(out, info)
     return info
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """``{"ppo": {"gamma": 0.9}}`` as ``{"ppo.gamma": 0.9}``."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return flat
 
 
 def _run(tasks: list[Task], workers: int, console: Console) -> list[tuple[Task, Exception]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -376,8 +376,8 @@ def to_json(info: RunInfo | DatasetInfo) -> dict[str, Any]:
         FormatError: it holds a value that JSON cannot.
     """
     try:
-        plain: dict[str, Any] = msgspec.to_builtins(info)
-        json.dumps(plain, allow_nan=False)
+        # Not msgspec: it leaves out fields that it filled with defaults when it parsed.
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(info), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise FormatError(
             "the metadata holds a value that JSON cannot",
