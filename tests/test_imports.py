@@ -61,7 +61,7 @@ ALLOWED = {
         "tipl.tokens",
         "door weighttraj",
     ],
-    "tipl.baselines": ["tipl.representation", "door weighttraj"],
+    "tipl.baselines": ["tipl.forecast", "tipl.representation", "door weighttraj"],
     "tipl.train": [
         "tipl.errors",
         "tipl.forecast",

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from tipl.forecast import check_request
 from tipl.representation import TemporalSVD
 from weighttraj import Run
 
@@ -25,6 +26,7 @@ class Persistence:
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
         """phi_t, once a horizon."""
+        check_request(run, starts, horizons)
         last = run.weights[np.asarray(starts)]
         return np.repeat(last[:, None], len(horizons), axis=1)
 
@@ -48,13 +50,18 @@ class Reconstruction:
 
     rank: int
     """Rank of the basis."""
-    name = "reconstruction"
     causal = False
+
+    @property
+    def name(self) -> str:
+        """Name in tables and figures."""
+        return f"reconstruction-{self.rank}"
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
         """phi_{t+h} projected to the first d directions of the run."""
+        check_request(run, starts, horizons)
         weights = run.weights[:]
         svd = TemporalSVD.fit(weights, self.rank)
         later = np.asarray(starts)[:, None] + np.asarray(horizons)
@@ -63,7 +70,9 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write config.json."""
         Path(path).mkdir(parents=True, exist_ok=True)
-        (Path(path) / "config.json").write_text(json.dumps({"kind": self.name, "rank": self.rank}))
+        (Path(path) / "config.json").write_text(
+            json.dumps({"kind": "reconstruction", "rank": self.rank})
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Reconstruction:

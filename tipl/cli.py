@@ -70,7 +70,7 @@ def _report(
 
 def _table(results: dict[str, Any]) -> Table:
     modes = results["modes"]
-    table = Table(title=f"{results['data']}, unseen runs: {', '.join(results['runs'])}")
+    table = Table(title=f"{results['data']}, {results['split']} runs: {', '.join(results['runs'])}")
     for column in ("forecaster", "h", "WPE", "skill", *(f"REPW {mode}" for mode in modes)):
         table.add_column(column, justify="left" if column == "forecaster" else "right")
     for row in report.table(results):

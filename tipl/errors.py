@@ -13,6 +13,10 @@ class ModelError(WeightTrajError, ValueError):
     """A model that cannot be loaded, or does not fit the data."""
 
 
+class ForecastError(WeightTrajError, ValueError):
+    """Starts or horizons that a run does not have."""
+
+
 class TrainError(WeightTrajError, ValueError):
     """A training that cannot be started or continued."""
 

@@ -157,7 +157,7 @@ def _all_errors(
         raise EvaluateError(
             "two forecasters have the same name",
             got=[f.name for f in forecasters],
-            do="evaluate them one at a time",
+            do="a model is named after its folder: rename one",
         )
     bar = progress.add_task("weights", total=len(runs) * len(forecasters))
     for run in runs:
@@ -220,7 +220,8 @@ class _Scorer:
     def __call__(self, policy: Policy, episodes: str = "same") -> float:
         self._progress.advance(self._bar)
         stats = policy.stats
-        key = (episodes, policy.weights.tobytes(), b"" if stats is None else stats.mean.tobytes())
+        norm = b"" if stats is None else stats.mean.tobytes() + stats.var.tobytes()
+        key = (episodes, policy.weights.tobytes(), norm)
         if key not in self._known:
             play = self._evaluators[episodes]
             played = play(policy, deterministic=self._deterministic)
@@ -240,7 +241,7 @@ def _returns_of_run(
     true, again = np.zeros(shape), np.zeros(shape)
     by_name = {f.name: np.zeros(shape) for f in forecasters}
     forecasts = {f.name: f.forecast(run, starts.tolist(), horizons.tolist()) for f in forecasters}
-    causal = {f.name: f.causal or f.name != Reconstruction.name for f in forecasters}
+    floors = {f.name for f in forecasters if isinstance(f, Reconstruction)}
     for i, t in enumerate(starts):
         now = run.load_policy(int(t))
         for j, h in enumerate(horizons):
@@ -249,7 +250,7 @@ def _returns_of_run(
             again[i, j] = score(later, "fresh") if i == 0 or j == 0 else np.nan
             for name, weights in forecasts.items():
                 # A forecast acts with the normaliser of its start: the later one is the future's.
-                base = now if causal[name] else later
+                base = later if name in floors else now
                 by_name[name][i, j] = score(base.with_weights(weights[i, j]))
     return _Returns(true, again, by_name)
 
@@ -271,6 +272,7 @@ def _summary(
         wpe = (summed / sum(e.count for e in errors[name])).tolist()
         by_name[name] = {
             "causal": forecaster.causal,
+            "floor": isinstance(forecaster, Reconstruction),
             "skill": [{"h": h, **row} for h, row in zip(hs, skill, strict=True)],
             "wpe": [{"h": h, "value": v} for h, v in zip(hs, wpe, strict=True)],
             "repw": {m: _repw(name, hs, found) for m, found in returns.items()},

@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from tipl.errors import ModelError
+from tipl.errors import ForecastError, ModelError
 from tipl.models.gpt import GPT, GPTConfig
 from tipl.representation import TemporalSVD
 from tipl.tokens import history
@@ -58,6 +58,26 @@ class Forecaster(Protocol):
         ...
 
 
+def check_request(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> None:
+    """Check what a forecaster was asked for.
+
+    Raises:
+        ForecastError: a start is no snapshot of the run, or a horizon is below 1.
+    """
+    if not (
+        len(starts)
+        and len(horizons)
+        and 0 <= min(starts) <= max(starts) < len(run)
+        and min(horizons) >= 1
+    ):
+        raise ForecastError(
+            "there is no such forecast",
+            expected=f"starts from 0 to {len(run) - 1}, horizons from 1",
+            got=f"starts {list(starts)}, horizons {list(horizons)}",
+            where=run.path,
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class TIPLConfig:
     """What a saved TIPL says of itself."""
@@ -76,7 +96,8 @@ class TIPL:
 
     model: GPT
     config: TIPLConfig
-    name = "tipl"
+    name: str = "tipl"
+    """Name in tables and figures: of the folder that it was loaded from."""
     causal = False
 
     def forecast(
@@ -87,6 +108,7 @@ class TIPL:
         Raises:
             ModelError: the run has another cadence, or goes on after the last time embedding.
         """
+        check_request(run, starts, horizons)
         self._check(run, max(starts) + max(horizons))
         weights = run.weights[:]
         svd = TemporalSVD.fit(weights, self.config.gpt.rank)
@@ -160,4 +182,4 @@ class TIPL:
                 where=path,
                 do="train it again, or restore both files from a copy",
             ) from error
-        return cls(model, config)
+        return cls(model, config, path.resolve().name)

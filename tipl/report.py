@@ -16,10 +16,9 @@ from tipl.errors import EvaluateError
 LABELS = {
     "tipl": "TIPL",
     "persistence": "copy",
-    "reconstruction": "rank floor",
 }
 SHOWN_HORIZONS = (1, 2, 5, 10)
-COLORS = {"tipl": "#c0392b", "persistence": "#2c3e50", "reconstruction": "#7f8c8d"}
+COLORS = {"tipl": "#c0392b", "persistence": "#2c3e50"}
 
 
 def verdict(results: dict[str, Any]) -> str:
@@ -28,7 +27,7 @@ def verdict(results: dict[str, Any]) -> str:
     copy = by_name["persistence"]
     sentences = []
     for name, scores in by_name.items():
-        if name in ("persistence", "reconstruction"):
+        if name == "persistence" or scores["floor"]:
             continue
         skills = scores["skill"]
         better = [row["h"] for row in skills if row["value"] > 0]
@@ -53,7 +52,7 @@ def verdict(results: dict[str, Any]) -> str:
 
 def label(name: str) -> str:
     """What a forecaster is called in text."""
-    return LABELS.get(name, name)
+    return LABELS.get(name, name.replace("reconstruction-", "floor, rank "))
 
 
 def table(results: dict[str, Any]) -> list[dict[str, Any]]:
@@ -113,10 +112,10 @@ def figure(results: dict[str, Any], mode: str) -> Figure:
         for axes, rows in ((wpe, scores["wpe"]), (repw, scores["repw"].get(mode, []))):
             if rows:
                 h, y = [row["h"] for row in rows], [row["value"] for row in rows]
-                axes.plot(h, y, "o-", ms=3, label=label(name), color=COLORS.get(name))
+                axes.plot(h, y, "o-", ms=3, label=label(name), color=_color(name, scores))
         for points in scores["returns"].get(mode, []):
             true, forecast = points["true"], points["forecast"]
-            scatter.plot(true, forecast, "o", ms=3, alpha=0.5, color=COLORS.get(name))
+            scatter.plot(true, forecast, "o", ms=3, alpha=0.5, color=_color(name, scores))
     if mode in results["noise_floor"]:
         floor = results["noise_floor"][mode]
         repw.axhline(floor, ls=":", color="black")
@@ -130,6 +129,10 @@ def figure(results: dict[str, Any], mode: str) -> Figure:
     scatter.axline((0, 0), slope=1, ls=":", color="black")
     wpe.legend(fontsize=8)
     return fig
+
+
+def _color(name: str, scores: dict[str, Any]) -> str | None:
+    return "#7f8c8d" if scores["floor"] else COLORS.get(name)
 
 
 def _style(axes: Axes, x: str, y: str) -> None:

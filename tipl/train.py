@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass
@@ -86,8 +87,16 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
-    _check_folder(config)
+    _check_folder(config, runs)
     start = _load_state(config.out, model, optimizer)
+    if start > config.n_batches:
+        raise TrainError(
+            "the folder holds a longer training than was asked for",
+            expected=f"at most {config.n_batches} batches",
+            got=start,
+            where=config.out,
+            do="raise --n-batches, or choose another --out",
+        )
     forecaster = TIPL(model, tipl_config)
     with Progress(console=console or Console(quiet=True)) as progress:
         bar = progress.add_task("training", total=config.n_batches, completed=start)
@@ -168,7 +177,8 @@ def _model_config(config: TrainConfig, runs: list[wt.Run]) -> TIPLConfig:
         )
     gpt = GPTConfig(
         rank=config.rank,
-        max_timestep=max(len(run) for run in runs),
+        # The last snapshot has no successor, so the network never sees its index.
+        max_timestep=max(len(run) for run in runs) - 1,
         block_size=config.block_size,
         n_layer=config.n_layer,
         n_head=config.n_head,
@@ -178,9 +188,10 @@ def _model_config(config: TrainConfig, runs: list[wt.Run]) -> TIPLConfig:
     return TIPLConfig(gpt=gpt, every=every.pop())
 
 
-def _check_folder(config: TrainConfig) -> None:
-    """Keep the settings beside the model, and refuse to go on with others."""
+def _check_folder(config: TrainConfig, runs: list[wt.Run]) -> None:
+    """Keep the settings beside the model, and refuse to go on with others, or on other data."""
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()}
+    plain["runs"] = {r.id: hashlib.sha256(r["digest"][:].tobytes()).hexdigest() for r in runs}
     file = config.out / "train.json"
     if file.exists():
         old = json.loads(file.read_text())
@@ -188,14 +199,16 @@ def _check_folder(config: TrainConfig) -> None:
         other = {k: v for k, v in plain.items() if old.get(k) != v and k not in may_differ}
         if other:
             raise TrainError(
-                "the folder holds a training with other settings",
+                "the folder holds a training with other settings or data",
                 expected={k: old.get(k) for k in other},
                 got=other,
                 where=config.out,
                 do="choose another --out, or delete the folder",
             )
     config.out.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(plain, indent=1))
+    draft = config.out / ".train.json.draft"
+    draft.write_text(json.dumps(plain, indent=1))
+    draft.replace(file)
 
 
 def _save_state(out: Path, model: GPT, optimizer: torch.optim.Optimizer, n: int) -> None:

@@ -221,6 +221,13 @@ def test_the_record_says_what_made_it(full_run: wt.Run) -> None:
     assert wt.verify(full_run.path) == []
 
 
+def test_diagnostics_are_never_known_too_early(tmp_path: Path) -> None:
+    learn(SMALL, WeightTrajectoryCallback(tmp_path / "run.zarr", every=5))  # 8 steps an update
+    run = wt.open_run(tmp_path / "run.zarr")
+    known = run["index/gradient_step"][np.isfinite(run["train/approx_kl"][:])]  # type: ignore[index]
+    assert known.tolist() == [32]
+
+
 @pytest.mark.parametrize(("every", "steps"), [(5, [0, 5, 10, 15, 20, 25, 30, 32]), (64, [0, 32])])
 def test_the_last_weights_are_stored_exactly_once(
     every: int, steps: list[int], tmp_path: Path
@@ -274,6 +281,10 @@ def scaled_env() -> gym.Env[Any, Any]:
     return gym.wrappers.TransformObservation(env, lambda o: 2 * o, env.observation_space)
 
 
+def rescaled_env() -> gym.Env[Any, Any]:
+    return gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), -1, 1)
+
+
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
@@ -304,6 +315,20 @@ def scaled_env() -> gym.Env[Any, Any]:
             lambda: PPO("MlpPolicy", "Pendulum-v1", n_steps=64, use_sde=True, device="cpu"),
             "state-dependent exploration",
         ),
+        (
+            lambda: PPO("MlpPolicy", SubprocVecEnv([rescaled_env]), n_steps=64, device="cpu"),
+            "environment wrapper RescaleAction",
+        ),
+        (
+            lambda: PPO(
+                "MlpPolicy",
+                "Pendulum-v1",
+                n_steps=64,
+                policy_kwargs={"activation_fn": lambda: torch.nn.LeakyReLU(0.2)},
+                device="cpu",
+            ),
+            "hidden modules",
+        ),
     ],
 )
 def test_other_policies_are_recorded_all_the_same(
@@ -312,6 +337,7 @@ def test_other_policies_are_recorded_all_the_same(
     model = make()
     model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr", every=4))
     run = wt.open_run(tmp_path / "run.zarr")
+    model.get_env().close()  # type: ignore[union-attr]
     assert np.array_equal(run.weights[-1], flat(model))
     with pytest.raises(PolicyError, match=reason):
         run.load_policy()
@@ -385,6 +411,13 @@ def test_a_callback_records_one_training(tmp_path: Path) -> None:
     learn(SMALL, callback)
     with pytest.raises(CollectError, match="second call"):
         learn(SMALL, callback)
+
+
+def test_moments_of_an_optimizer_without_them_are_refused(tmp_path: Path) -> None:
+    model = A2C("MlpPolicy", "Pendulum-v1", device="cpu")
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", optimizer_moments=True)
+    with pytest.raises(CollectError, match="RMSprop"):
+        model.learn(5, callback=callback)
 
 
 @pytest.mark.parametrize("every", [0, -1])

@@ -187,7 +187,7 @@ def test_a_run_that_does_not_repeat_itself_starts_over(small_dataset: Path, tmp_
 
 
 def test_another_recipe_does_not_touch_a_data_set(small_dataset: Path) -> None:
-    other = replace(SMALL_RECIPE, ppo=replace(SMALL, gamma=0.9))
+    other = replace(SMALL_RECIPE, ppo=replace(SMALL_RECIPE.ppo, gamma=0.9))
     with pytest.raises(
         CollectError, match=r"(?s)another recipe.*'ppo.gamma': 0.99}.*'ppo.gamma': 0.9}"
     ):

@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from weighttraj.errors import (
 from weighttraj.format import ObsNorm, ParamLayout, PolicySpec, RunInfo, RunWriter
 
 LAYOUT = ParamLayout.of({"w": ((3, 4), "weight", ("hidden_0", "observation"))})
+MASK = np.arange(20) % 3 == 1
 INFO = RunInfo(
     run_id="run",
     layout=LAYOUT,
@@ -99,7 +101,9 @@ def test_what_is_written_is_read(run: wt.Run) -> None:
     assert wt.verify(run.path) == []
 
 
-@pytest.mark.parametrize("key", [0, -1, slice(3, 17), slice(2, 20, 5), slice(-3, None), [4, 1, -1]])
+@pytest.mark.parametrize(
+    "key", [0, -1, slice(3, 17), slice(2, 20, 5), slice(-3, None), [4, 1, -1], MASK]
+)
 def test_rows_are_selected_as_numpy_does(run: wt.Run, key: object) -> None:
     assert np.array_equal(run.weights[key], weights(20)[key])
     assert np.array_equal(np.asarray(run.weights), weights(20))
@@ -109,7 +113,7 @@ def test_columns_are_selected_as_numpy_does(run: wt.Run) -> None:
     assert np.array_equal(run.weights[2:9, 3:7], weights(20)[2:9, 3:7])
 
 
-@pytest.mark.parametrize("key", [20, -21, [0, 20], slice(None, None, -1), 1.5])
+@pytest.mark.parametrize("key", [20, -21, [0, 20], slice(None, None, -1), 1.5, [True]])
 def test_rows_that_are_not_committed_are_refused(run: wt.Run, key: object) -> None:
     with pytest.raises(IndexError):
         run.weights[key]
@@ -249,6 +253,43 @@ def test_an_exception_commits_what_came_before_it(tmp_path: Path) -> None:
     run = wt.open_run(path)
     assert (len(run), run.info.status) == (11, "crashed")
     assert wt.verify(path) == []
+
+
+def test_an_interrupt_at_any_line_of_append_shifts_no_row(tmp_path: Path) -> None:
+    rows, place = weights(12), 0
+    while True:
+        path, calls = tmp_path / f"{place}.zarr", 0
+
+        def interrupt(frame: Any, event: str, _: object, place: int = place) -> Any:
+            nonlocal calls
+            if frame.f_code.co_filename.endswith("writer.py"):
+                calls += event == "line"
+                if calls == place:
+                    calls += 1
+                    raise KeyboardInterrupt
+                return interrupt
+            return None
+
+        writer = RunWriter(path, INFO)
+        for t in range(9):
+            append(writer, t, rows[t])
+        try:
+            sys.settrace(interrupt)
+            append(writer, 9, rows[9])
+            done = True
+        except KeyboardInterrupt:
+            done = False
+        finally:
+            sys.settrace(None)
+        writer.close("crashed")
+        run = wt.open_run(path)
+        assert len(run) in (9, 10)
+        assert np.array_equal(run.weights[:], rows[: len(run)])
+        assert run.num_timesteps.tolist() == [10 * t for t in range(len(run))]
+        if done:
+            break
+        place += 7
+    assert place > 50
 
 
 def test_a_continued_run_has_the_bytes_of_an_undisturbed_one(tmp_path: Path) -> None:
@@ -420,6 +461,13 @@ def test_damaged_metadata_is_found(run: wt.Run) -> None:
     (run.path / "policy/weights/zarr.json").write_text(json.dumps(document))
     with pytest.raises(FormatError, match="not what the run's metadata says"):
         run.weights[:]
+
+
+def test_changed_metadata_do_not_match_their_checksum(run: wt.Run) -> None:
+    text = (run.path / "zarr.json").read_text()
+    (run.path / "zarr.json").write_text(text.replace('"epsilon": 1e-08', '"epsilon": 3e-08'))
+    with pytest.raises(DamageError, match="checksum"):
+        wt.open_run(run.path)
 
 
 def test_a_newer_store_is_refused(run: wt.Run) -> None:

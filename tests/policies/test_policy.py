@@ -87,6 +87,25 @@ def test_an_episode_does_not_depend_on_the_others(full_run: wt.Run, deterministi
     assert np.array_equal(many.returns, again.returns)
 
 
+def test_the_runs_own_time_limit_holds(full_run: wt.Run) -> None:
+    env = full_run.info.env
+    assert env is not None
+    short = evaluate(full_run.load_policy(-1), replace(env, max_episode_steps=5), episodes=4)
+    assert short.lengths.tolist() == [5] * 4
+
+
+def test_files_that_a_run_names_are_not_opened(full_run: wt.Run) -> None:
+    class Elsewhere(wt.Run):
+        @property
+        def info(self) -> wt.RunInfo:
+            info = super().info
+            env = replace(info.env, kwargs={"xml_file": "/etc/model.xml"})  # type: ignore[type-var]
+            return replace(info, env=env)
+
+    with pytest.raises(PolicyError, match=r"/etc/model\.xml"):
+        evaluate(full_run.load_policy(0), Elsewhere(full_run.path))
+
+
 def test_a_run_without_environment_cannot_be_evaluated(full_run: wt.Run) -> None:
     class Nowhere(wt.Run):
         @property

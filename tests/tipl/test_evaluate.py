@@ -24,7 +24,7 @@ def results(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     model = train(
         TrainConfig(
             data=small_dataset,
-            out=out / "model",
+            out=out / "tipl",
             rank=8,
             n_batches=20,
             warmup=5,
@@ -81,8 +81,8 @@ def test_skill_and_interval_by_hand() -> None:
 
 def test_the_floor_is_below_the_model(results: Path) -> None:
     by_name = load(results)["forecasters"]
-    assert by_name["reconstruction"]["skill"][0]["value"] > 0.5
-    assert by_name["tipl"]["skill"][0]["value"] < by_name["reconstruction"]["skill"][0]["value"]
+    assert by_name["reconstruction-8"]["skill"][0]["value"] > 0.5
+    assert by_name["tipl"]["skill"][0]["value"] < by_name["reconstruction-8"]["skill"][0]["value"]
     assert by_name["tipl"]["causal"] is False
     interval = by_name["tipl"]["skill"][0]
     assert interval["low"] <= interval["value"] <= interval["high"]
@@ -130,8 +130,15 @@ def test_the_verdict_is_plain(skills: tuple[float, float], word: str) -> None:
         for h, v in zip((1, 10), skills, strict=True)
     ]
     repw = {"sampled": [{"h": 1, "value": 3.0}]}
-    copy = {"skill": rows, "repw": {"sampled": [{"h": 1, "value": 2.0}]}}
-    said = verdict({"forecasters": {"persistence": copy, "tipl": {"skill": rows, "repw": repw}}})
+    copy = {"floor": False, "skill": rows, "repw": {"sampled": [{"h": 1, "value": 2.0}]}}
+    said = verdict(
+        {
+            "forecasters": {
+                "persistence": copy,
+                "tipl": {"floor": False, "skill": rows, "repw": repw},
+            }
+        }
+    )
     assert f"TIPL {word} copying the last weights" in said
     assert "larger (1.5 times the copy's)" in said
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,8 +10,8 @@ import pytest
 import torch
 
 import weighttraj as wt
-from tipl import TIPL, TemporalSVD, TrainConfig, train
-from tipl.errors import ModelError, TrainError
+from tipl import TIPL, Persistence, Reconstruction, TemporalSVD, TrainConfig, train
+from tipl.errors import ForecastError, ModelError, TrainError
 from weighttraj.errors import FormatError
 
 
@@ -100,6 +101,26 @@ def test_other_settings_are_not_mixed(config: TrainConfig) -> None:
         train(replace(config, rank=9))
 
 
+def test_other_data_are_not_mixed(config: TrainConfig, tmp_path: Path) -> None:
+    train(config)
+    other = tmp_path / "dataset"
+    shutil.copytree(config.data, other)
+    document = json.loads((other / "dataset.json").read_text())
+    document["runs"][2]["split"] = "train"
+    (other / "dataset.json").write_text(json.dumps(document))
+    with pytest.raises(TrainError, match="seed0002"):
+        train(replace(config, data=other))
+    moved = tmp_path / "moved"
+    shutil.copytree(config.data, moved)
+    train(replace(config, data=moved))
+
+
+def test_a_longer_training_is_not_passed_off_as_a_shorter_one(config: TrainConfig) -> None:
+    train(config)
+    with pytest.raises(TrainError, match="longer training"):
+        train(replace(config, n_batches=5))
+
+
 def test_a_data_set_without_training_runs_is_refused(config: TrainConfig, tmp_path: Path) -> None:
     (tmp_path / "dataset").mkdir()
     document = json.loads((config.data / "dataset.json").read_text())
@@ -129,8 +150,12 @@ def test_a_damaged_model_is_not_loaded(config: TrainConfig) -> None:
 
 def test_runs_that_do_not_fit_the_model_are_refused(config: TrainConfig) -> None:
     model, run = train(config), wt.open(config.data).split("test").runs[0]
-    with pytest.raises(ModelError, match="up to snapshot 49"):
-        model.forecast(run, [45], [10])
+    with pytest.raises(ModelError, match="up to snapshot 48"):
+        model.forecast(run, [48], [1])
+    for starts, horizons in (([-1], [1]), ([49], [1]), ([3], [0]), ([], [1])):
+        for forecaster in (model, Persistence(), Reconstruction(3)):
+            with pytest.raises(ForecastError, match="starts from 0 to 48, horizons from 1"):
+                forecaster.forecast(run, starts, horizons)
     other = TIPL(model.model, replace(model.config, every=64))
     with pytest.raises(ModelError, match="another cadence"):
         other.forecast(run, [1], [1])

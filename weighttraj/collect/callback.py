@@ -37,7 +37,7 @@ class WeightTrajectoryCallback(BaseCallback):
     The first snapshot is the policy before training, the last one the policy after it. No random
     number is drawn and nothing is evaluated, so training is the same bit by bit with and without
     this callback. Each row of the store holds only what was known when its snapshot was taken:
-    an update's diagnostics stand beside the last snapshot of the update, NaN beside the others.
+    an update's diagnostics stand beside the snapshot of its end, NaN beside the others.
 
     Args:
         path: folder of the run to be written, ``<data set>/runs/<run id>.zarr``.
@@ -91,6 +91,7 @@ class WeightTrajectoryCallback(BaseCallback):
         self.resume = resume
         self._algorithm: OnPolicyAlgorithm
         self._writer: RunWriter | None = None
+        self._closed = False
 
     @property
     def writer(self) -> RunWriter:
@@ -109,9 +110,13 @@ class WeightTrajectoryCallback(BaseCallback):
 
     def close(self, status: Status = "crashed") -> None:
         """Commit what is left and stop recording. Does nothing after training has ended well."""
-        if self._writer is not None:
+        if self._writer is not None and not self._closed:
+            self._closed = True
             self._hook.remove()
-            self._writer.close(status)
+            try:
+                self._append_pending()
+            finally:
+                self._writer.close(status)
 
     def __enter__(self) -> WeightTrajectoryCallback:
         return self
@@ -129,6 +134,14 @@ class WeightTrajectoryCallback(BaseCallback):
                 do="make a new callback, with a new path, for the second call",
             )
         self._norm = find_normalizers(model.get_env() or self.training_env)
+        if self.optimizer_moments and not isinstance(model.policy.optimizer, torch.optim.Adam):
+            raise CollectError(
+                "this optimizer has no moments to store",
+                expected="Adam or AdamW",
+                got=type(model.policy.optimizer).__name__,
+                where=type(model).__name__,
+                do="leave optimizer_moments out",
+            )
         info = self._describe(model, self._norm)
         self._actor = actor_parameters(model.policy)
         self._critic = critic_parameters(model.policy)
@@ -186,10 +199,9 @@ class WeightTrajectoryCallback(BaseCallback):
             self._snapshot()
 
     def _on_training_end(self) -> None:
-        self._finish_iteration()
         if self._step % self.every:
             self._snapshot()
-        self._append_pending()
+        self._finish_iteration()
         self.close("complete")
 
     def _snapshot(self) -> None:
@@ -215,8 +227,8 @@ class WeightTrajectoryCallback(BaseCallback):
         }
 
     def _finish_iteration(self) -> None:
-        """Put the diagnostics of the update that just ended beside its last snapshot."""
-        if self._pending is not None and 0 < self._pending["iteration"] == self._iteration:
+        """Put the diagnostics of the update that just ended beside the snapshot of its end."""
+        if self._pending is not None and self._pending["gradient_step"] == self._step > 0:
             logged = self.logger.name_to_value
             for name in DIAGNOSTICS.get(type(self.model).__name__, ()):
                 self._pending["train"][name] = float(logged.get(f"train/{name}", np.nan))

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
@@ -127,13 +128,17 @@ def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]
             "action_high": tuple(policy.action_space.high.reshape(-1).tolist()),
         }
     elif isinstance(policy.action_space, spaces.Discrete):
-        head = {"head": "categorical", "action_start": int(policy.action_space.start)}
+        head = {"head": "categorical"}
+        if policy.action_space.start != 0:
+            reasons.append("discrete actions that do not start at 0, which SB3 does not support")
     else:
         reasons.append(f"actions in {policy.action_space}, or state-dependent exploration")
     if policy.squash_output:
         reasons.append("actions squashed by tanh")
     if not isinstance(space, spaces.Box):
         reasons.append(f"observations in a {type(space).__name__} space")
+    if is_image_space(space):
+        reasons.append("observations that SB3 takes for images and scales")
     reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
     return PolicySpec(
         kind="other" if reasons else "mlp",
@@ -219,7 +224,8 @@ def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, l
     linear = [i for i, module in enumerate(net) if isinstance(module, nn.Linear)]
     kinds = {type(m) for m in net if not isinstance(m, nn.Linear)}
     known = kinds & _ACTIVATIONS.keys()
-    if kinds != known or len(kinds) > 1 or len(net) != 2 * len(linear):
+    changed = [m for m in net if type(m) in known and repr(m) != repr(type(m)())]
+    if kinds != known or len(kinds) > 1 or len(net) != 2 * len(linear) or changed:
         names = sorted(kind.__name__ for kind in kinds)
         reasons.append(f"hidden modules {names}, not one activation after each linear layer")
     activation = next((_ACTIVATIONS[kind] for kind in known), "")

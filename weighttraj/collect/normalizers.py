@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FunctionType
 from typing import Any
 
 import gymnasium as gym
@@ -70,6 +72,7 @@ def find_normalizers(env: VecEnv) -> Normalizers:
     unknown = [type(w).__name__ for w in vec_wrappers if not isinstance(w, known_vec)]
     chain, obs_sources, ret_sources = _inner_wrappers(base)
     unknown += [type(w).__name__ for i, w in enumerate(chain) if not _is_known(w, chain[i + 1 :])]
+    unknown += _unknown_by_name(base)
 
     sources = [_gymnasium_obs(chain, w) for w in obs_sources]
     sources += [_vec_obs(w) for w in vec_normalize if w.norm_obs and _has_array_stats(w)]
@@ -118,6 +121,14 @@ def _inner_wrappers(base: VecEnv) -> tuple[list[Any], list[Any], list[Any]]:
     return chains[0], obs, ret
 
 
+def _unknown_by_name(base: VecEnv) -> list[str]:
+    """Unknown wrappers of the environments that cannot be looked into: all but the first here."""
+    texts = base.env_method("__str__")[1 if isinstance(base, DummyVecEnv) else 0 :]
+    names = {name for text in texts for name in re.findall(r"<(\w+)(?=<)", text)}
+    known = {kind.__name__ for kind in (*_HARMLESS, gw.NormalizeObservation, ClipObservation)}
+    return sorted(names - known - {"ClipReward"})
+
+
 def _unwrap(env: Any, kind: type, attribute: str) -> tuple[list[Any], Any]:
     chain = []
     while isinstance(env, kind):
@@ -159,16 +170,13 @@ def _gymnasium_obs(
     low, high = (
         (None, None) if not bounds else (max(b[0] for b in bounds), min(b[1] for b in bounds))
     )
-    # Gymnasium keeps float32 statistics until the first float64 observation arrives.
-    inner = wrapper.env.observation_space.dtype
-    kept_in_32 = inner is not None and inner.kind == "f" and inner.itemsize <= 4
     spec = ObsNorm(
         source="gymnasium.NormalizeObservation",
         epsilon=wrapper.epsilon,
         shape=tuple(wrapper.obs_rms.mean.shape),
         clip_low=low,
         clip_high=high,
-        dtype="float32" if kept_in_32 else "float64",
+        dtype=str(wrapper.obs_rms.mean.dtype),
     )
     return spec, lambda: _copy(wrapper.obs_rms)
 
@@ -180,13 +188,17 @@ def _clip_bounds(wrapper: Any) -> tuple[float, float] | None:
     """
     if isinstance(wrapper, ClipObservation):
         return wrapper.low, wrapper.high
+    func = getattr(wrapper, "func", None)
+    # Asked only if asking cannot change it: a function without a state of its own.
+    if not isinstance(func, FunctionType) or func.__closure__ is not None:
+        return None
     if not isinstance(wrapper, gw.TransformObservation):
         return None
     shape = wrapper.env.observation_space.shape or ()
     probes = np.random.default_rng(0).normal(size=(64, *shape)).astype(np.float32)
     probes *= np.logspace(-30, 30, 64, dtype=np.float32).reshape(-1, *(1 for _ in shape))
     try:
-        answers = np.stack([np.asarray(wrapper.func(p.copy())) for p in probes])
+        answers = np.stack([np.asarray(func(p.copy())) for p in probes])
     except Exception:
         return None
     low, high = float(answers.min()), float(answers.max())

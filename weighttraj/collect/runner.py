@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
+from filelock import FileLock
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from stable_baselines3.common.callbacks import BaseCallback
@@ -67,10 +68,12 @@ def collect(
     """
     out = Path(out)
     console = console or Console(quiet=True)
-    info = _prepare(recipe, out, seeds)
+    out.mkdir(parents=True, exist_ok=True)
+    with _lock(out):
+        info = _prepare(recipe, out, seeds)
     wanted = set(recipe.splits() if seeds is None else seeds)
     tasks: list[Task] = []
-    failures: list[tuple[Task, Exception]] = []
+    failures: list[tuple[Task, BaseException]] = []
     for entry in info.runs:
         if entry.seed not in wanted:
             continue
@@ -84,7 +87,8 @@ def collect(
         if not state.startswith("complete"):
             tasks.append(task)
     failures += _run(tasks, workers, console)
-    again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
+    with _lock(out):
+        again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
     failures = [f for f in failures if not isinstance(f[1], ReplayError)]
     failures += _run(again, workers, console)
     if failures:
@@ -94,7 +98,8 @@ def collect(
             where=out,
             do="mend the cause and give the same command again: it goes on where it stopped",
         )
-    _write_info(out, _with_status(out, read_dataset_info(out)))
+    with _lock(out):
+        _write_info(out, _with_status(out, read_dataset_info(out)))
     return open_dataset(out)
 
 
@@ -152,7 +157,7 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
                 do="choose another folder with --out",
             )
         info = replace(old, recipe=document)
-    elif out.exists() and any(out.iterdir()):
+    elif out.exists() and any(not path.name.startswith(".") for path in out.iterdir()):
         raise CollectError(
             "the folder is not empty and holds no data set",
             expected="a new or empty folder, or one with dataset.json",
@@ -169,7 +174,6 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
         split = cast(Literal["train", "validation", "test", ""], splits.get(seed, ""))
         known[seed] = replace(known[seed], split=split)
     info = replace(info, status="collecting", runs=tuple(known.values()))
-    out.mkdir(parents=True, exist_ok=True)
     _write_info(out, info)
     return info
 
@@ -183,17 +187,17 @@ def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _run(tasks: list[Task], workers: int, console: Console) -> list[tuple[Task, Exception]]:
+def _run(tasks: list[Task], workers: int, console: Console) -> list[tuple[Task, BaseException]]:
     """Do the tasks; return those that failed."""
     if not tasks:
         return []
-    failures: list[tuple[Task, Exception]] = []
+    failures: list[tuple[Task, BaseException]] = []
     with _progress(tasks, console) as report:
         if workers == 1:
             for task in tasks:
                 try:
                     collect_run(task, report)
-                except (WeightTrajError, OSError, RuntimeError) as error:
+                except Exception as error:
                     failures.append((task, error))
         else:
             failures += _run_in_processes(tasks, workers, report)
@@ -202,9 +206,9 @@ def _run(tasks: list[Task], workers: int, console: Console) -> list[tuple[Task, 
 
 def _run_in_processes(
     tasks: list[Task], workers: int, report: Report
-) -> list[tuple[Task, Exception]]:
+) -> list[tuple[Task, BaseException]]:
     context = multiprocessing.get_context("spawn")
-    failures: list[tuple[Task, Exception]] = []
+    failures: list[tuple[Task, BaseException]] = []
     with (
         context.Manager() as manager,
         ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context) as pool,
@@ -213,14 +217,18 @@ def _run_in_processes(
         futures: dict[Future[None], Task] = {
             pool.submit(collect_run, task, steps_reporter(steps)): task for task in tasks
         }
-        while not all(future.done() for future in futures) or not steps.empty():
-            with contextlib.suppress(queue.Empty):
-                report(*steps.get(timeout=0.2))
+        try:
+            while not all(future.done() for future in futures) or not steps.empty():
+                with contextlib.suppress(queue.Empty):
+                    report(*steps.get(timeout=0.2))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
         for future, task in futures.items():
             error = future.exception()
             if isinstance(error, BrokenProcessPool):
                 error = CollectError("its process was killed", do="is there enough memory?")
-            if isinstance(error, Exception):
+            if error is not None:
                 failures.append((task, error))
     return failures
 
@@ -268,7 +276,7 @@ def _state(path: Path) -> str:
     )
 
 
-def _mismatches(failures: list[tuple[Task, Exception]]) -> list[tuple[Task, ReplayError]]:
+def _mismatches(failures: list[tuple[Task, BaseException]]) -> list[tuple[Task, ReplayError]]:
     return [(task, error) for task, error in failures if isinstance(error, ReplayError)]
 
 
@@ -287,6 +295,11 @@ def _start_over(out: Path, task: Task, error: ReplayError, console: Console) -> 
         f"seed {task.seed}: starting over as {name}; what it had committed stays in {old.path}"
     )
     return replace(task, path=out / new.path)
+
+
+def _lock(out: Path) -> FileLock:
+    """Held while ``dataset.json`` is read and written: several may collect into one data set."""
+    return FileLock(out.with_name(f".{out.name}.lock"))
 
 
 def _with_status(out: Path, info: DatasetInfo) -> DatasetInfo:

@@ -305,6 +305,8 @@ def _rows(key: Any, n: int, where: str) -> Any:
             raise IndexError(f"slices go forward only (step {step}) in {where}")
         return slice(start, max(start, stop), step)
     index = np.asarray(key)
+    if index.dtype == bool and index.shape == (n,):
+        return np.flatnonzero(index)
     if index.dtype.kind not in "iu" or ((index < -n) | (index >= n)).any():
         raise IndexError(f"row {key!r} is not one of the {n} committed rows of {where}")
     index = np.where(index < 0, index + n, index)

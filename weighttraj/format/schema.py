@@ -21,6 +21,7 @@ FORMAT_VERSION = 1
 
 Status = Literal["collecting", "complete", "crashed"]
 Axis = Literal["time", "iteration"]
+AXES: tuple[Axis, ...] = ("time", "iteration")
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _MAX_ROW = 2**31  # elements; beyond it a snapshot is taken for damaged metadata
@@ -69,8 +70,6 @@ class PolicySpec:
     """Lower bounds of a continuous action, flattened; actions are clipped to them."""
     action_high: tuple[float, ...] = ()
     """Upper bounds of a continuous action, flattened."""
-    action_start: int = 0
-    """First value of a discrete action."""
     cannot_rebuild: tuple[str, ...] = ()
     """Reasons why the policy cannot be rebuilt from this description; empty: it can."""
 

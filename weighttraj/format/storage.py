@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -29,6 +30,9 @@ _EMPTY_CHUNKS = {"array.write_empty_chunks": True}
 
 ATTRIBUTE = "weighttraj"
 """Key of the run's metadata in the attributes of its Zarr group."""
+
+CHECKSUM = "weighttraj_sha256"
+"""Key of the metadata's checksum."""
 
 
 class _CommittedStore(LocalStore):
@@ -63,6 +67,7 @@ class RunStore:
         self.path = path
         self.info = info
         self.specs = arrays_of(info)
+        self._unsynced: set[Path] = set()
         self._readable: dict[str, zarr.Array[Any]] = {}
         self._writable: dict[str, zarr.Array[Any]] = {}
 
@@ -139,6 +144,7 @@ class RunStore:
                 array.resize((stop, *array.shape[1:]))
             values = np.ascontiguousarray(values, array.dtype)
             array[start:stop] = values
+            self._unsynced |= self._files(name, start, stop)
             if np.asarray(array[start:stop]).tobytes() != values.tobytes():
                 raise DamageError(
                     "what was written reads back as something else",
@@ -147,14 +153,26 @@ class RunStore:
                 )
 
     def commit(self, info: RunInfo) -> None:
-        """Make the metadata, and with it the committed rows, visible in one atomic replace."""
-        document = {
-            "zarr_format": 3,
-            "node_type": "group",
-            "attributes": {ATTRIBUTE: to_json(info)},
-        }
+        """Make the metadata, and with it the committed rows, visible in one atomic replace.
+
+        What was written before is on the disk first, so that a power cut finds it there.
+        """
+        for path in self._unsynced:
+            _sync(path)
+        self._unsynced.clear()
+        metadata = to_json(info)
+        attributes = {ATTRIBUTE: metadata, CHECKSUM: checksum(metadata)}
+        document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
         replace_file(self.path / "zarr.json", json.dumps(document, indent=1).encode())
         self.info = info
+
+    def _files(self, name: str, start: int, stop: int) -> set[Path]:
+        """Files and folders that hold some rows of an array."""
+        folder = self.path / name
+        blocks = range(start // self.info.block, -(-stop // self.info.block))
+        inner = "/0" * len(self.specs[name].inner)
+        files = {folder / f"c/{block}{inner}" for block in blocks} | {folder / "zarr.json"}
+        return files | {file.parent for file in files} | {folder / "c"}
 
     def trim(self) -> None:
         """Cut the arrays to the committed rows, so that plain Zarr shows nothing else."""
@@ -174,7 +192,7 @@ class RunStore:
         where = f"{self.path}, array {spec.name!r}"
         try:
             with zarr.config.set(_EMPTY_CHUNKS):
-                array = zarr.open_array(store, path=name, mode="r+")
+                array = zarr.open_array(store, path=name, mode="r+", zarr_format=3)
         except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
             raise DamageError(
                 "the metadata of an array is missing or damaged",
@@ -213,7 +231,31 @@ def read_info(path: Path) -> RunInfo:
             where=path,
             do="open a run's folder, <data set>/runs/<id>.zarr",
         )
-    return parse(attributes[ATTRIBUTE], RunInfo, file)
+    metadata = attributes[ATTRIBUTE]
+    info = parse(metadata, RunInfo, file)
+    if attributes.get(CHECKSUM) != checksum(metadata):
+        raise DamageError(
+            "the metadata does not match its checksum",
+            expected=attributes.get(CHECKSUM),
+            got=checksum(metadata),
+            where=file,
+            do="restore the file from a copy",
+        )
+    return info
+
+
+def checksum(metadata: Any) -> str:
+    """SHA-256 of metadata as JSON with sorted keys and no spaces."""
+    text = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -224,6 +266,7 @@ def replace_file(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     draft.replace(path)
+    _sync(path.parent)
 
 
 def _create_array(group: zarr.Group, spec: ArraySpec, block: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from jaxtyping import Float32
 
 from weighttraj.errors import FormatError, ReplayError, SnapshotError, StoreLockedError
-from weighttraj.format.schema import ArraySpec, Axis, RunInfo, Status, with_progress
+from weighttraj.format.schema import AXES, ArraySpec, Axis, RunInfo, Status, to_json, with_progress
 from weighttraj.format.storage import RunStore
 
 Moments = tuple[np.ndarray, np.ndarray, float]
@@ -61,8 +61,9 @@ class RunWriter:
         self.replayed_from = info.n_committed
         """Committed snapshots found at the start: that many are compared, not written."""
         self._committed_digests = self._store.read("digest", slice(0, info.n_committed))
-        self._n_seen: dict[Axis, int] = {"time": 0, "iteration": 0}
-        self._buffers = {spec.name: self._tail(spec) for spec in self._store.specs.values()}
+        self._at_start = {axis: info.committed(axis) for axis in AXES}
+        self._compared: dict[Axis, int] = dict.fromkeys(AXES, 0)
+        self._blocks: dict[Axis, _Block] = {axis: self._tail(axis) for axis in AXES}
         self._closed = False
 
     @property
@@ -135,17 +136,15 @@ class RunWriter:
     def flush(self, status: Status = "collecting") -> None:
         """Write and commit everything appended so far."""
         store = self._store
-        for spec in store.specs.values():
-            rows = self._buffers[spec.name]
-            if rows:
-                store.write(self._start(spec), {spec.name: np.stack(rows)})
-        done = {a: max(n, store.info.committed(a)) for a, n in self._n_seen.items()}
-        store.commit(
-            with_progress(store.info, status=status, time=done["time"], iteration=done["iteration"])
-        )
-        for spec in store.specs.values():
-            full = len(self._buffers[spec.name]) // store.info.block * store.info.block
-            del self._buffers[spec.name][:full]
+        for axis, block in self._blocks.items():
+            for spec in self._specs(axis) if block.rows else []:
+                values = np.stack([row[spec.name] for row in block.rows])
+                store.write(block.first, {spec.name: values})
+        time, iteration = (self._blocks[a].first + len(self._blocks[a].rows) for a in AXES)
+        store.commit(with_progress(store.info, status=status, time=time, iteration=iteration))
+        for axis, block in self._blocks.items():
+            full = len(block.rows) // store.info.block * store.info.block
+            self._blocks[axis] = _Block(block.first + full, block.rows[full:])
 
     def close(self, status: Status = "complete") -> None:
         """Commit what is left, mark the run and release the lock. Closing twice does nothing."""
@@ -153,11 +152,11 @@ class RunWriter:
             return
         self._closed = True
         try:
-            if status == "complete" and self._n_seen["time"] < self.replayed_from:
+            if status == "complete" and self._compared["time"] < self.replayed_from:
                 raise ReplayError(
                     "a continued run ended before the snapshots it had committed",
                     expected=f"at least {self.replayed_from} snapshots",
-                    got=self._n_seen["time"],
+                    got=self._compared["time"],
                     where=self.path,
                     do="continue with the settings the run was started with",
                 )
@@ -180,7 +179,7 @@ class RunWriter:
     def _append(self, axis: Axis, values: Mapping[str, Any]) -> None:
         if self._closed:
             raise SnapshotError("the run is closed", where=self.path, do="open a new RunWriter")
-        specs = [spec for spec in self._store.specs.values() if spec.axis == axis]
+        specs = self._specs(axis)
         rows = {spec.name: _row(spec, values) for spec in specs}
         unknown = sorted(values.keys() - rows.keys())
         if unknown:
@@ -191,14 +190,14 @@ class RunWriter:
                 where=self.path,
                 do="describe them in the RunInfo before the run starts",
             )
-        n = self._n_seen[axis]
-        if n < self._store.info.committed(axis):
+        n = self._compared[axis]
+        if n < self._at_start[axis]:
             self._compare(n, rows)
-        else:
-            for name, row in rows.items():
-                self._buffers[name].append(row)
-        self._n_seen[axis] = n + 1
-        if any(len(self._buffers[spec.name]) == self._store.info.block for spec in specs):
+            self._compared[axis] = n + 1
+            return
+        # The only change, so an interrupt leaves a whole row or none.
+        self._blocks[axis].rows.append(rows)
+        if len(self._blocks[axis].rows) >= self._store.info.block:
             self.flush()
 
     def _compare(self, n: int, rows: Mapping[str, np.ndarray]) -> None:
@@ -212,16 +211,26 @@ class RunWriter:
                 "run.info.provenance names, or collect under a new run id",
             )
 
-    def _start(self, spec: ArraySpec) -> int:
-        """Row at which the buffered block begins."""
-        last = max(self._n_seen[spec.axis], self._store.info.committed(spec.axis))
-        return last - len(self._buffers[spec.name])
+    def _specs(self, axis: Axis) -> list[ArraySpec]:
+        return [spec for spec in self._store.specs.values() if spec.axis == axis]
 
-    def _tail(self, spec: ArraySpec) -> list[np.ndarray]:
-        """Rows of the last, partly filled block: it will be written again as a whole."""
-        n = self._store.info.committed(spec.axis)
-        start = n // self._store.info.block * self._store.info.block
-        return [np.asarray(row) for row in self._store.read(spec.name, slice(start, n))]
+    def _tail(self, axis: Axis) -> _Block:
+        """The last, partly filled block: it will be written again as a whole."""
+        n = self._store.info.committed(axis)
+        first = n // self._store.info.block * self._store.info.block
+        tail = {s.name: self._store.read(s.name, slice(first, n)) for s in self._specs(axis)}
+        rows = [{name: np.asarray(v[i]) for name, v in tail.items()} for i in range(n - first)]
+        return _Block(first, rows)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Rows that are not committed, or share a block with such rows."""
+
+    first: int
+    """Row of the run that ``rows[0]`` is; it begins a block."""
+    rows: list[dict[str, np.ndarray]]
+    """Each row, by array."""
 
 
 _NOTHING: dict[str, Any] = {"status": "collecting", "time": 0, "iteration": 0}
@@ -251,13 +260,13 @@ def _reopen(path: Path, info: RunInfo) -> RunStore:
             where=path,
             do="choose another run id or path",
         )
-    ours = replace(info, **{name: getattr(old, name) for name in _MAY_DIFFER})
-    if ours != old:
-        names = [n for n in vars(ours) if getattr(ours, n) != getattr(old, n)]
+    before, now = to_json(old), to_json(info)
+    names = [n for n in now if n not in _MAY_DIFFER and now[n] != before[n]]
+    if names:
         raise FormatError(
             "the run was started with other settings",
-            expected={name: getattr(old, name) for name in names},
-            got={name: getattr(ours, name) for name in names},
+            expected={name: before[name] for name in names},
+            got={name: now[name] for name in names},
             where=path,
             do="continue with the settings of the start, or choose another path",
         )

@@ -149,7 +149,7 @@ class Policy:
     def to_actions(self, values: Tensor) -> np.ndarray:
         """Actions for the environment: shaped, and clipped to the action space."""
         if self._log_std is None:
-            return np.asarray(values.numpy() + self.spec.action_start)
+            return values.numpy()
         shape = self.spec.action_shape
         low, high = (
             np.array(x, np.float32).reshape(shape)

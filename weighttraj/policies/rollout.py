@@ -28,8 +28,9 @@ class Evaluator:
     """Plays the same episodes with one policy after another.
 
     Episode i starts from ``reset(seed=seed + i)`` and samples its actions with a generator of its
-    own, so two policies meet the same starts and the same noise, and the number of episodes does
-    not change any one of them. Raw observations and rewards: the policy brings its normaliser.
+    own, so two policies meet the same starts and the same noise, however many episodes there are.
+    (Actions are computed for all episodes at once: the last bit of an action may depend on how many
+    still run.) Raw observations and rewards: the policy brings its normaliser.
 
     Args:
         env: the environment, as a run describes it.
@@ -42,7 +43,10 @@ class Evaluator:
 
     def __init__(self, env: EnvInfo, *, episodes: int = 20, seed: int = 0) -> None:
         self.seed = seed
-        self._envs = [environments.make(env.id, **env.kwargs) for _ in range(episodes)]
+        limit = (
+            {} if env.max_episode_steps is None else {"max_episode_steps": env.max_episode_steps}
+        )
+        self._envs = [environments.make(env.id, **limit, **env.kwargs) for _ in range(episodes)]
 
     def __call__(self, policy: Policy, *, deterministic: bool = True) -> EpisodeReturns:
         """Play every episode to its end."""
@@ -112,13 +116,21 @@ def env_of(run: Run) -> EnvInfo:
     """The environment of a run.
 
     Raises:
-        PolicyError: the run does not say.
+        PolicyError: the run does not say, or names files: those of a data set are not to be opened.
     """
     if run.info.env is None:
         raise PolicyError(
             "the run does not say which environment it was trained in",
             where=run.path,
             do="pass weighttraj.format.EnvInfo(id=...) instead of the run",
+        )
+    paths = [v for v in run.info.env.kwargs.values() if isinstance(v, str) and set(v) & set("/\\")]
+    if paths:
+        raise PolicyError(
+            "the run's environment is made from files of the machine it was trained on",
+            got=paths,
+            where=run.path,
+            do="if you trust the data, pass run.info.env instead of the run",
         )
     return run.info.env
 
