@@ -14,8 +14,8 @@ setup: .venv/installed
 
 demo: setup ## collect four runs, train TIPL on three, judge it on the fourth: about five minutes
 	$(BIN)/weighttraj collect datasets/demo/recipe.toml --out $(DEMO)/dataset --workers 2
-	$(BIN)/tipl train --data $(DEMO)/dataset --out $(DEMO)/tipl --n-batches 600 --warmup 100 --save-every 100
-	$(BIN)/tipl evaluate $(DEMO)/tipl --data $(DEMO)/dataset --out $(DEMO)/report --return-starts 6 --episodes 5
+	$(BIN)/tipl train --data $(DEMO)/dataset --out $(DEMO)/tipl --n-batches 500 --warmup 100 --save-every 100
+	$(BIN)/tipl evaluate $(DEMO)/tipl --data $(DEMO)/dataset --out $(DEMO)/report --return-starts 5 --episodes 5
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest -q -n 2

@@ -21,7 +21,7 @@ README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```(python|bash)\n(.*?)```", README, re.DOTALL)
 
 # The commands run as they stand, on a shorter recipe and with less of what only takes time.
-SHORTER = {"--n-batches 600": "--n-batches 4", "--episodes 5": "--episodes 1"}
+SHORTER = {"--n-batches 500": "--n-batches 4", "--episodes 5": "--episodes 1"}
 NOT_RUN = ("make ",)  # they would run this test
 
 
