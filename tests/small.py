@@ -41,7 +41,7 @@ def random_states(model: PPO) -> list[Any]:
     env = model.get_env().envs[0]  # type: ignore[union-attr]
     return [
         torch.get_rng_state().tolist(),
-        np.random.get_state()[1].tolist(),  # noqa: shuffles with it
+        np.random.get_state()[1].tolist(),
         random.getstate(),
         env.unwrapped.np_random.bit_generator.state,
         env.action_space.np_random.bit_generator.state,

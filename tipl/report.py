@@ -106,7 +106,7 @@ def figure(results: dict[str, Any], mode: str) -> Figure:
     Left: WPE and REPW against the forecast step. Right: return of the true policy against the
     return of the forecast policy, over all steps.
     """
-    fig = Figure(figsize=(12, 3.8), layout="constrained")
+    fig = Figure(figsize=(12, 4.2), layout="constrained")
     wpe, repw, scatter = fig.subplots(1, 3)
     for name, scores in results["forecasters"].items():
         for axes, rows in ((wpe, scores["wpe"]), (repw, scores["repw"].get(mode, []))):
@@ -118,16 +118,14 @@ def figure(results: dict[str, Any], mode: str) -> Figure:
             scatter.plot(true, forecast, "o", ms=3, alpha=0.5, color=_color(name, scores))
     if mode in results["noise_floor"]:
         floor = results["noise_floor"][mode]
-        repw.axhline(floor, ls=":", color="black")
-        text = "noise floor: true policy, other episodes"
-        repw.annotate(text, (0.02, floor), xycoords=("axes fraction", "data"), va="bottom", size=7)
+        repw.axhline(floor, ls=":", color="black", label="noise floor: true policy, other episodes")
     _style(wpe, "forecast step h", "WPE: mean squared error of weights")
     wpe.set_yscale("log")
     _style(repw, "forecast step h", f"REPW: |J(true) - J(forecast)|, {mode}")
     repw.set_ylim(bottom=0)
     _style(scatter, "J(true policy)", "J(forecast policy)")
     scatter.axline((0, 0), slope=1, ls=":", color="black")
-    wpe.legend(fontsize=8)
+    fig.legend(*repw.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
     return fig
 
 
