@@ -83,7 +83,7 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
     mean, std = sampler.moments()
     model.input_mean.copy_(mean)
     model.input_std.copy_(std + 1e-6)
-    model.to(config.device)
+    _to_device(model, config.device)
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
     )
@@ -112,6 +112,18 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
     model.eval()
     forecaster.save(config.out)
     return forecaster
+
+
+def _to_device(model: GPT, device: str) -> None:
+    try:
+        model.to(device)
+    except (RuntimeError, AssertionError) as error:  # torch raises both
+        raise TrainError(
+            "this device cannot be used",
+            expected="cpu, or a device that this build of torch and this machine have",
+            got=f"{device!r}: {error}",
+            do="choose another --device",
+        ) from error
 
 
 def weight_prediction_error(
@@ -175,10 +187,18 @@ def _model_config(config: TrainConfig, runs: list[wt.Run]) -> TIPLConfig:
             where=config.data,
             do="train on one data set of one cadence",
         )
+    longest = max(len(run) for run in runs)
+    if config.n_embd % config.n_head or config.block_size > longest:
+        raise TrainError(
+            "these sizes make no model for these runs",
+            expected=f"n_embd a multiple of n_head, block_size at most {longest} snapshots",
+            got=f"n_embd {config.n_embd}, n_head {config.n_head}, block_size {config.block_size}",
+            do="change --n-embd, --n-head or --block-size",
+        )
     gpt = GPTConfig(
         rank=config.rank,
         # The last snapshot has no successor, so the network never sees its index.
-        max_timestep=max(len(run) for run in runs) - 1,
+        max_timestep=longest - 1,
         block_size=config.block_size,
         n_layer=config.n_layer,
         n_head=config.n_head,

@@ -19,6 +19,7 @@ import pytest
 import torch
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
 
@@ -248,6 +249,21 @@ def test_a2c_is_collected(tmp_path: Path) -> None:
     observation = np.array([0.1, 0.2, 0.3], np.float32)
     expected = model.predict(observation, deterministic=True)[0]
     assert np.array_equal(run.load_policy().predict(observation, deterministic=True)[0], expected)
+
+
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
+def test_several_environments_share_one_policy(vec_env: type, tmp_path: Path) -> None:
+    kwargs = {"start_method": "fork"} if vec_env is SubprocVecEnv else {}
+    env = make_vec_env("Pendulum-v1", n_envs=3, vec_env_cls=vec_env, vec_env_kwargs=kwargs)
+    env = VecNormalize(env)
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, device="cpu")
+    model.learn(192, callback=WeightTrajectoryCallback(tmp_path / "run.zarr", every=4))
+    raw = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    expected = model.predict(env.normalize_obs(raw), deterministic=True)[0]
+    env.close()
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert run.info.policy.cannot_rebuild == ()
+    assert np.array_equal(run.load_policy().predict(raw, deterministic=True)[0], expected)
 
 
 def test_cleanrls_clipping_lambda_is_understood(tmp_path: Path) -> None:

@@ -159,6 +159,33 @@ def test_a_killed_collector_goes_on_where_it_was(
     assert wt.verify(path) == []
 
 
+def test_ctrl_c_stops_every_worker_and_starts_no_other_seed(
+    recipe_file: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "dataset"
+    text = TOML.replace("= 768", "= 76_800").replace('"0:2"', '"0:4"').replace("[2, 3]", "[]")
+    recipe_file.write_text(text)
+    command = [sys.executable, "-m", "weighttraj.cli", "collect", str(recipe_file)]
+    command += ["--out", str(out), "--workers", "2"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    while len(list(out.glob("runs/*.zarr"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)  # an impatient second time
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "give the same command again" in said
+    assert "Traceback" not in said
+    runs = sorted(out.glob("runs/*.zarr"))
+    assert [path.name for path in runs] == ["seed0000.zarr", "seed0001.zarr"]
+    assert {wt.open_run(path).info.status for path in runs} == {"crashed"}
+    assert wt.verify(out) == []
+
+
 def test_a_run_that_does_not_repeat_itself_starts_over(small_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "dataset"
     info = wt.open(small_dataset).runs[0].info
@@ -212,6 +239,12 @@ def test_a_failing_run_leaves_the_others_whole(tmp_path: Path, workers: int) -> 
         collect(recipe, out, workers=workers)
     assert wt.open_run(out / "runs/seed0002.zarr").info.status == "complete"
     assert wt.open_run(out / "runs/seed0000.zarr").info.status == "complete"
+
+
+def test_no_workers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CollectError, match="workers at least 1"):
+        collect(one_seed(), tmp_path / "dataset", workers=0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_environment_fails_each_run_clearly(tmp_path: Path) -> None:

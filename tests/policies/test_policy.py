@@ -94,6 +94,14 @@ def test_the_runs_own_time_limit_holds(full_run: wt.Run) -> None:
     assert short.lengths.tolist() == [5] * 4
 
 
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1"])
+def test_a_policy_of_another_environment_is_refused(full_run: wt.Run, env_id: str) -> None:
+    with pytest.raises(PolicyError, match="does not fit the environment"):
+        evaluate(full_run.load_policy(0), env_id, episodes=1)
+    with pytest.raises(PolicyError, match="no episodes"):
+        evaluate(full_run.load_policy(0), full_run, episodes=0)
+
+
 def test_files_that_a_run_names_are_not_opened(full_run: wt.Run) -> None:
     class Elsewhere(wt.Run):
         @property

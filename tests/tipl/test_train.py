@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,6 +120,22 @@ def test_a_longer_training_is_not_passed_off_as_a_shorter_one(config: TrainConfi
     train(config)
     with pytest.raises(TrainError, match="longer training"):
         train(replace(config, n_batches=5))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n_head": 3}, "n_embd a multiple of n_head"),
+        ({"block_size": 50}, "block_size at most 49"),
+        ({"device": "xpu:9"}, "choose another --device"),
+    ],
+)
+def test_impossible_settings_leave_no_folder(
+    config: TrainConfig, change: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(TrainError, match=message):
+        train(replace(config, **change))
+    assert not config.out.exists()
 
 
 def test_a_data_set_without_training_runs_is_refused(config: TrainConfig, tmp_path: Path) -> None:

@@ -124,7 +124,9 @@ def _inner_wrappers(base: VecEnv) -> tuple[list[Any], list[Any], list[Any]]:
 def _unknown_by_name(base: VecEnv) -> list[str]:
     """Unknown wrappers of the environments that cannot be looked into: all but the first here."""
     texts = base.env_method("__str__")[1 if isinstance(base, DummyVecEnv) else 0 :]
-    names = {name for text in texts for name in re.findall(r"<(\w+)(?=<)", text)}
+    # "<Wrapper<Env<Id-v0>>>", or "<Wrapper<Env instance>>" where there is no id
+    texts = [re.sub(r"<\w+<[^<> ]*>>", "", text) for text in texts]
+    names = {name for text in texts for name in re.findall(r"<(\w+)(?![\w ])", text)}
     known = {kind.__name__ for kind in (*_HARMLESS, gw.NormalizeObservation, ClipObservation)}
     return sorted(names - known - {"ClipReward"})
 

@@ -6,6 +6,8 @@ import contextlib
 import json
 import multiprocessing
 import queue
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -65,7 +67,10 @@ def collect(
     Raises:
         CollectError: the folder holds another data set, or a run failed.
         RecipeError: the recipe contradicts itself.
+        KeyboardInterrupt: it was stopped; what was committed stays.
     """
+    if workers < 1:
+        raise CollectError("nobody to do the work", expected="workers at least 1", got=workers)
     out = Path(out)
     console = console or Console(quiet=True)
     out.mkdir(parents=True, exist_ok=True)
@@ -211,18 +216,26 @@ def _run_in_processes(
     failures: list[tuple[Task, BaseException]] = []
     with (
         context.Manager() as manager,
-        ProcessPoolExecutor(min(workers, len(tasks)), mp_context=context) as pool,
+        # Interrupts are the business of this process: it tells the others to stop.
+        ProcessPoolExecutor(
+            min(workers, len(tasks)),
+            mp_context=context,
+            initializer=signal.signal,
+            initargs=(signal.SIGINT, signal.SIG_IGN),
+        ) as pool,
     ):
-        steps = manager.Queue()
+        steps, stop = manager.Queue(), manager.Event()
         futures: dict[Future[None], Task] = {
-            pool.submit(collect_run, task, steps_reporter(steps)): task for task in tasks
+            pool.submit(_collect_in_process, task, steps, stop): task for task in tasks
         }
         try:
             while not all(future.done() for future in futures) or not steps.empty():
                 with contextlib.suppress(queue.Empty):
                     report(*steps.get(timeout=0.2))
         except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
+            stop.set()
+            with _deaf_to_interrupts():
+                pool.shutdown(wait=True, cancel_futures=True)
             raise
         for future, task in futures.items():
             error = future.exception()
@@ -233,17 +246,29 @@ def _run_in_processes(
     return failures
 
 
-def steps_reporter(steps: Any) -> Report:
-    """A picklable function that puts progress into a queue."""
-    return _QueueReporter(steps)
+def _collect_in_process(task: Task, steps: Any, stop: Any) -> None:
+    """Collect one run in a worker; it stops, with what it has committed, when it is told to."""
+
+    def report(seed: int, num_timesteps: int) -> None:
+        steps.put((seed, num_timesteps))
+        if stop.is_set():
+            raise KeyboardInterrupt
+
+    if not stop.is_set():
+        collect_run(task, report)
 
 
-class _QueueReporter:
-    def __init__(self, steps: Any) -> None:
-        self._steps = steps
-
-    def __call__(self, seed: int, num_timesteps: int) -> None:
-        self._steps.put((seed, num_timesteps))
+@contextlib.contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """While workers finish their rollouts, a second Ctrl-C would only tear the pool apart."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

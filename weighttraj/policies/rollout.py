@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
@@ -39,9 +40,12 @@ class Evaluator:
 
     Raises:
         CollectError: the environment is not registered here.
+        PolicyError: fewer than one episode.
     """
 
     def __init__(self, env: EnvInfo, *, episodes: int = 20, seed: int = 0) -> None:
+        if episodes < 1:
+            raise PolicyError("no episodes to play", expected="at least 1", got=episodes)
         self.seed = seed
         limit = (
             {} if env.max_episode_steps is None else {"max_episode_steps": env.max_episode_steps}
@@ -49,8 +53,13 @@ class Evaluator:
         self._envs = [environments.make(env.id, **limit, **env.kwargs) for _ in range(episodes)]
 
     def __call__(self, policy: Policy, *, deterministic: bool = True) -> EpisodeReturns:
-        """Play every episode to its end."""
+        """Play every episode to its end.
+
+        Raises:
+            PolicyError: the policy's observations or actions are not the environment's.
+        """
         envs = self._envs
+        _check_spaces(policy, envs[0])
         observations = [env.reset(seed=self.seed + i)[0] for i, env in enumerate(envs)]
         noise = [np.random.default_rng([self.seed + i, 1]) for i in range(len(envs))]
         returns, lengths = np.zeros(len(envs)), np.zeros(len(envs), np.int64)
@@ -88,7 +97,7 @@ class Evaluator:
 
 def evaluate(
     policy: Policy,
-    env: EnvInfo | Run,
+    env: EnvInfo | Run | str,
     *,
     episodes: int = 20,
     seed: int = 0,
@@ -98,7 +107,7 @@ def evaluate(
 
     Args:
         policy: from ``run.load_policy(t)``.
-        env: the environment, or a run that was trained in it.
+        env: the environment, its id, or a run that was trained in it.
         episodes: number of episodes.
         seed: of the first episode; episode i starts from ``seed + i``.
         deterministic: act by the distribution's mode, else by samples.
@@ -108,6 +117,8 @@ def evaluate(
     """
     if isinstance(env, Run):
         env = env_of(env)
+    elif isinstance(env, str):
+        env = EnvInfo(id=env)
     with Evaluator(env, episodes=episodes, seed=seed) as evaluator:
         return evaluator(policy, deterministic=deterministic)
 
@@ -133,6 +144,22 @@ def env_of(run: Run) -> EnvInfo:
             do="if you trust the data, pass run.info.env instead of the run",
         )
     return run.info.env
+
+
+def _check_spaces(policy: Policy, env: gym.Env[Any, Any]) -> None:
+    observed, acted = env.observation_space, env.action_space
+    spec = policy.spec
+    kind = gym.spaces.Box if spec.head == "gaussian" else gym.spaces.Discrete
+    fits = isinstance(acted, kind) and acted.shape == spec.action_shape
+    if observed.shape != spec.observation_shape or not fits:
+        raise PolicyError(
+            "the policy does not fit the environment",
+            expected=f"observations {spec.observation_shape}, {spec.head} actions "
+            f"{spec.action_shape}",
+            got=f"observations {observed}, actions {acted}",
+            where=env,
+            do="evaluate it in the environment it was trained in",
+        )
 
 
 def _act(policy: Policy, raw: np.ndarray, noise: list[np.random.Generator] | None) -> np.ndarray:
