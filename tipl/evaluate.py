@@ -19,8 +19,7 @@ from tipl.baselines import Persistence, Reconstruction
 from tipl.errors import EvaluateError
 from tipl.forecast import TIPL, Forecaster
 from tipl.report import write_report
-from weighttraj.policies import Evaluator, Policy
-from weighttraj.policies.rollout import env_of
+from weighttraj.policies import Evaluator, Policy, env_of
 
 Mode = Literal["deterministic", "sampled"]
 MAX_BYTES = 256 * 2**20
@@ -58,16 +57,6 @@ class _Errors:
     forecast: Float[np.ndarray, " horizon"]
     copy: Float[np.ndarray, " horizon"]
     count: int
-
-
-def load_forecaster(path: str | Path) -> TIPL | Persistence:
-    """A forecaster by name (``persistence``) or from the folder where it was saved.
-
-    Raises:
-        FileNotFoundError: there is none.
-        ModelError: the folder's files do not belong together.
-    """
-    return Persistence() if str(path) == Persistence.name else TIPL.load(path)
 
 
 def evaluate(

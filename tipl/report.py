@@ -13,10 +13,7 @@ from matplotlib.figure import Figure
 
 from tipl.errors import EvaluateError
 
-LABELS = {
-    "tipl": "TIPL",
-    "persistence": "copy",
-}
+LABELS = {"tipl": "TIPL", "persistence": "copy"}
 SHOWN_HORIZONS = (1, 2, 5, 10)
 COLORS = {"tipl": "#c0392b", "persistence": "#2c3e50"}
 

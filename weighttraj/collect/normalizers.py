@@ -24,8 +24,7 @@ from stable_baselines3.common.vec_env import (
 from weighttraj.collect.wrappers import ClipObservation, TruncationAsTermination
 from weighttraj.errors import CollectError
 from weighttraj.format.schema import ObsNorm
-
-Moments = tuple[np.ndarray, np.ndarray, float]
+from weighttraj.format.writer import Moments
 
 # Wrappers that leave observations alone and do not change what an action means: SB3 clips
 # actions to the space's bounds anyway. Those that touch only rewards count as such.

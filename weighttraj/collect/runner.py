@@ -25,7 +25,7 @@ from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.recipe import Recipe
 from weighttraj.errors import CollectError, ReplayError, WeightTrajError
-from weighttraj.format import Dataset, DatasetInfo, RunEntry, open_dataset
+from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_dataset
 from weighttraj.format.reader import read_dataset_info
 from weighttraj.format.schema import to_json
 from weighttraj.format.storage import read_info, replace_file
@@ -77,20 +77,7 @@ def collect(
     with _lock(out):
         info = _prepare(recipe, out, seeds)
     wanted = set(recipe.splits() if seeds is None else seeds)
-    tasks: list[Task] = []
-    failures: list[tuple[Task, BaseException]] = []
-    for entry in info.runs:
-        if entry.seed not in wanted:
-            continue
-        task = Task(recipe=recipe, seed=entry.seed, path=out / entry.path)
-        try:
-            state = _state(task.path)
-        except WeightTrajError as error:
-            failures.append((task, error))
-            continue
-        console.print(f"seed {entry.seed}: {state}")
-        if not state.startswith("complete"):
-            tasks.append(task)
+    tasks, failures = _plan(recipe, out, [run for run in info.runs if run.seed in wanted], console)
     failures += _run(tasks, workers, console)
     with _lock(out):
         again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
@@ -289,10 +276,28 @@ def _progress(tasks: list[Task], console: Console) -> Iterator[Report]:
         yield lambda seed, steps: progress.update(bars[seed], completed=steps)
 
 
-def _state(path: Path) -> str:
-    if not path.exists():
+def _plan(
+    recipe: Recipe, out: Path, entries: list[RunEntry], console: Console
+) -> tuple[list[Task], list[tuple[Task, BaseException]]]:
+    """Runs that are still to be made, and those that cannot be read."""
+    tasks: list[Task] = []
+    unreadable: list[tuple[Task, BaseException]] = []
+    for entry in entries:
+        task = Task(recipe=recipe, seed=cast(int, entry.seed), path=out / entry.path)
+        try:
+            info = read_info(task.path) if task.path.exists() else None
+        except (WeightTrajError, FileNotFoundError) as error:
+            unreadable.append((task, error))
+            continue
+        console.print(f"seed {task.seed}: {_progress_of(info)}")
+        if info is None or info.status != "complete":
+            tasks.append(task)
+    return tasks, unreadable
+
+
+def _progress_of(info: RunInfo | None) -> str:
+    if info is None:
         return "to be collected"
-    info = read_info(path)
     if info.status == "complete":
         return f"complete, {info.n_committed} snapshots"
     return (
@@ -328,10 +333,8 @@ def _lock(out: Path) -> FileLock:
 
 
 def _with_status(out: Path, info: DatasetInfo) -> DatasetInfo:
-    done = all(
-        (out / run.path).exists() and _state(out / run.path).startswith("complete")
-        for run in info.runs
-    )
+    paths = [out / run.path for run in info.runs]
+    done = all(path.exists() and read_info(path).status == "complete" for path in paths)
     return replace(info, status="complete" if done else "collecting")
 
 

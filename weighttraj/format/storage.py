@@ -7,7 +7,6 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +94,7 @@ class RunStore:
         store = cls(draft, info)
         store.commit(info)
         draft.rename(path)
+        _sync(path.parent)
         store.path = path
         return store
 
@@ -129,28 +129,27 @@ class RunStore:
                 do="restore the array's files from a copy, or collect the run again",
             ) from error
 
-    def write(self, start: int, rows: Mapping[str, np.ndarray]) -> None:
-        """Write rows from ``start`` on, which begins a block, to each array; nothing is committed.
+    def write(self, name: str, start: int, values: np.ndarray) -> None:
+        """Write rows of an array from ``start`` on, which begins a block; nothing is committed.
 
         Every chunk is written whole and replaced atomically, then read back and compared.
 
         Raises:
             DamageError: what was read back is not what was written.
         """
-        for name, values in rows.items():
-            array = self._writable_array(name)
-            stop = start + len(values)
-            if array.shape[0] < stop:
-                array.resize((stop, *array.shape[1:]))
-            values = np.ascontiguousarray(values, array.dtype)
-            array[start:stop] = values
-            self._unsynced |= self._files(name, start, stop)
-            if np.asarray(array[start:stop]).tobytes() != values.tobytes():
-                raise DamageError(
-                    "what was written reads back as something else",
-                    where=f"{self.path}, array {name!r}, rows {start} to {stop}",
-                    do="check the disk; nothing of this block was committed",
-                )
+        array = self._writable_array(name)
+        stop = start + len(values)
+        if array.shape[0] < stop:
+            array.resize((stop, *array.shape[1:]))
+        values = np.ascontiguousarray(values, array.dtype)
+        array[start:stop] = values
+        self._unsynced |= self._files(name, start, stop)
+        if np.asarray(array[start:stop]).tobytes() != values.tobytes():
+            raise DamageError(
+                "what was written reads back as something else",
+                where=f"{self.path}, array {name!r}, rows {start} to {stop}",
+                do="check the disk; nothing of this block was committed",
+            )
 
     def commit(self, info: RunInfo) -> None:
         """Make the metadata, and with it the committed rows, visible in one atomic replace.
@@ -168,11 +167,11 @@ class RunStore:
 
     def _files(self, name: str, start: int, stop: int) -> set[Path]:
         """Files and folders that hold some rows of an array."""
-        folder = self.path / name
         blocks = range(start // self.info.block, -(-stop // self.info.block))
         inner = "/0" * len(self.specs[name].inner)
-        files = {folder / f"c/{block}{inner}" for block in blocks} | {folder / "zarr.json"}
-        return files | {file.parent for file in files} | {folder / "c"}
+        names = [f"{name}/zarr.json", *(f"{name}/c/{block}{inner}" for block in blocks)]
+        folders = {self.path / parent for file in names for parent in Path(file).parents}
+        return folders | {self.path / file for file in names}
 
     def trim(self) -> None:
         """Cut the arrays to the committed rows, so that plain Zarr shows nothing else."""
@@ -181,6 +180,7 @@ class RunStore:
             rows = self.info.committed(spec.axis)
             if array.shape[0] > rows:
                 array.resize((rows, *array.shape[1:]))
+                _sync(self.path / name / "zarr.json")
 
     def _writable_array(self, name: str) -> zarr.Array[Any]:
         if name not in self._writable:

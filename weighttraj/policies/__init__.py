@@ -9,8 +9,8 @@ except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "sb3") from error
 
 from weighttraj.policies.policy import Policy, load_policy
-from weighttraj.policies.rollout import EpisodeReturns, Evaluator, evaluate
+from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of, evaluate
 
-__all__ = ["EpisodeReturns", "Evaluator", "Policy", "evaluate", "load_policy"]
+__all__ = ["EpisodeReturns", "Evaluator", "Policy", "env_of", "evaluate", "load_policy"]
 
 del _gymnasium, _torch
