@@ -202,6 +202,7 @@ def _run_in_processes(
     context = multiprocessing.get_context("spawn")
     failures: list[tuple[Task, BaseException]] = []
     with (
+        _noted_interrupts() as interrupted,
         context.Manager() as manager,
         # Interrupts are the business of this process: it tells the others to stop.
         ProcessPoolExecutor(
@@ -215,15 +216,15 @@ def _run_in_processes(
         futures: dict[Future[None], Task] = {
             pool.submit(_collect_in_process, task, steps, stop): task for task in tasks
         }
-        try:
-            while not all(future.done() for future in futures) or not steps.empty():
-                with contextlib.suppress(queue.Empty):
-                    report(*steps.get(timeout=0.2))
-        except BaseException:
+        while not interrupted.is_set() and not (
+            all(future.done() for future in futures) and steps.empty()
+        ):
+            with contextlib.suppress(queue.Empty):
+                report(*steps.get(timeout=0.2))
+        if interrupted.is_set():
             stop.set()
-            with _deaf_to_interrupts():
-                pool.shutdown(wait=True, cancel_futures=True)
-            raise
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise KeyboardInterrupt
         for future, task in futures.items():
             error = future.exception()
             if isinstance(error, BrokenProcessPool):
@@ -246,14 +247,18 @@ def _collect_in_process(task: Task, steps: Any, stop: Any) -> None:
 
 
 @contextlib.contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """While workers finish their rollouts, a second Ctrl-C would only tear the pool apart."""
+def _noted_interrupts() -> Iterator[threading.Event]:
+    """Note Ctrl-C instead of raising it anywhere, also when it is pressed again and again.
+
+    An exception in the middle of the pool's own work would tear it apart.
+    """
+    noted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield noted  # only the main thread gets interrupts
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.signal(signal.SIGINT, lambda *_: noted.set())
     try:
-        yield
+        yield noted
     finally:
         signal.signal(signal.SIGINT, before)
 
