@@ -18,7 +18,20 @@ ALLOWED = {
     "weighttraj.errors": [],
     "weighttraj.format.layout": ["weighttraj.errors"],
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
-    "weighttraj.format.storage": ["weighttraj.errors", "weighttraj.format.schema"],
+    "weighttraj.format.objects": ["weighttraj.errors"],
+    "weighttraj.format.codecs": ["weighttraj.errors", "weighttraj.format.schema"],
+    "weighttraj.format.storage": [
+        "weighttraj.errors",
+        "weighttraj.format.codecs",
+        "weighttraj.format.objects",
+        "weighttraj.format.schema",
+    ],
+    "weighttraj.format.packing": [
+        "weighttraj.errors",
+        "weighttraj.format.objects",
+        "weighttraj.format.schema",
+        "weighttraj.format.storage",
+    ],
     "weighttraj.format.writer": [
         "weighttraj.errors",
         "weighttraj.format.schema",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -19,6 +20,26 @@ from weighttraj.format.storage import RunStore
 if TYPE_CHECKING:
     from weighttraj.load.windows import WindowDataset
     from weighttraj.policies.policy import Policy
+
+
+@runtime_checkable
+class ArrayStore(Protocol):
+    """What a run is read from: a Zarr group (``storage``) or an HDF5 file (``hdf5``)."""
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+
+    @property
+    def info(self) -> RunInfo:
+        """Metadata."""
+
+    @property
+    def specs(self) -> dict[str, ArraySpec]:
+        """Arrays, by name."""
+
+    def read(self, name: str, key: Any) -> np.ndarray:
+        """Read part of an array, within the committed rows; raises DamageError."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +61,7 @@ class StoredArray:
     compared with the digests of their snapshots.
     """
 
-    def __init__(self, store: RunStore, spec: ArraySpec) -> None:
+    def __init__(self, store: ArrayStore, spec: ArraySpec) -> None:
         self._store = store
         self._spec = spec
 
@@ -96,13 +117,35 @@ class StoredArray:
 
 
 class Run:
-    """One training run: its trajectory of weights and what belongs to each snapshot."""
+    """One training run: its trajectory of weights and what belongs to each snapshot.
 
-    def __init__(self, path: str | Path, split: str = "") -> None:
-        self.path = Path(path)
-        self.split = split
+    Opened by ``open_run`` or as one of ``Dataset.runs``, where it is read when it is first used.
+    """
+
+    def __init__(
+        self, path: Path, opener: Callable[[], ArrayStore], entry: RunEntry | None = None
+    ) -> None:
+        self.path = path
+        self._opener = opener
+        self._entry = entry
+
+    @cached_property
+    def _store(self) -> ArrayStore:
+        store = self._opener()
+        if self._entry is not None and store.info.run_id != self._entry.id:
+            raise FormatError(
+                "a run is not the one that the data set lists",
+                expected=self._entry.id,
+                got=store.info.run_id,
+                where=self.path,
+                do="restore the run from a copy",
+            )
+        return store
+
+    @property
+    def split(self) -> str:
         """Part of the data set: train, validation, test, or empty."""
-        self._store = RunStore.open(self.path)
+        return self._entry.split if self._entry else ""
 
     @property
     def info(self) -> RunInfo:
@@ -112,7 +155,7 @@ class Run:
     @property
     def id(self) -> str:
         """Id, unique in the data set."""
-        return self.info.run_id
+        return self._entry.id if self._entry else self.info.run_id
 
     @property
     def layout(self) -> ParamLayout:
@@ -252,8 +295,9 @@ def open_dataset(path: str | Path) -> Dataset:
     info = read_dataset_info(path)
     runs = []
     for entry in info.runs:
-        if (path / entry.path / "zarr.json").is_file():
-            runs.append(_open_entry(path, entry))
+        place = path / entry.path
+        if place.is_file() or (place / "zarr.json").is_file():
+            runs.append(Run(place, partial(RunStore.open, place), entry))
         elif info.status == "complete":
             raise DamageError(
                 "the data set lacks a run that it lists",
@@ -266,13 +310,15 @@ def open_dataset(path: str | Path) -> Dataset:
 
 
 def open_run(path: str | Path) -> Run:
-    """Open one run's folder, ``<data set>/runs/<id>.zarr``.
+    """Open one run: a folder ``<id>.zarr``, or a packed run ``<id>.zarr.zip``.
 
     Raises:
         FileNotFoundError: there is no run at the path.
         FormatError: it is none of this format.
     """
-    return Run(path)
+    run = Run(Path(path), partial(RunStore.open, Path(path)))
+    run._store  # noqa: B018  now, so that errors come from here
+    return run
 
 
 def read_dataset_info(path: Path) -> DatasetInfo:
@@ -282,19 +328,6 @@ def read_dataset_info(path: Path) -> DatasetInfo:
         hint = "; this is one run: use open_run" if (path / "zarr.json").is_file() else ""
         raise FileNotFoundError(f"no data set at {path}: it has no dataset.json{hint}")
     return parse_json(file.read_bytes(), DatasetInfo, file)
-
-
-def _open_entry(path: Path, entry: RunEntry) -> Run:
-    run = Run(path / entry.path, entry.split)
-    if run.id != entry.id:
-        raise FormatError(
-            "a run is not the one that the data set lists",
-            expected=entry.id,
-            got=run.id,
-            where=run.path,
-            do="restore the run's folder from a copy",
-        )
-    return run
 
 
 def _rows(key: Any, n: int, where: str) -> Any:

@@ -20,6 +20,7 @@ FORMAT_VERSION = 1
 """Version of the bytes on disk. It moves when they change, not with the package."""
 
 Status = Literal["collecting", "complete", "crashed"]
+Profile = Literal["default", "archive"]
 Axis = Literal["time", "iteration"]
 AXES: tuple[Axis, ...] = ("time", "iteration")
 
@@ -167,7 +168,9 @@ class RunInfo:
     provenance: Provenance = Provenance()
     """Versions and machine."""
     block: int = 64
-    """Snapshots in one chunk, and in one commit."""
+    """Snapshots in one commit and, while the run is collected, in one chunk."""
+    profile: Profile = "default"
+    """``default``: core codecs, any Zarr v3 reader; ``archive``: smallest, needs PCodec."""
     status: Status = "collecting"
     """``collecting``: being written, or killed; ``complete``; ``crashed``: ended by an error."""
     n_committed: int = 0
@@ -211,10 +214,10 @@ class RunEntry:
 
     def __post_init__(self) -> None:
         check_id(self.id, "run id")
-        if self.path != f"runs/{self.id}.zarr":
+        if self.path not in (f"runs/{self.id}.zarr", f"runs/{self.id}.zarr.zip"):
             raise FormatError(
                 "a run must lie in its data set, under its own name",
-                expected=f"runs/{self.id}.zarr",
+                expected=f"runs/{self.id}.zarr, or .zarr.zip",
                 got=self.path,
                 where=f"run {self.id!r} in dataset.json",
                 do="do not use data from a source that you do not trust",

@@ -1,10 +1,10 @@
-"""The only module that knows Zarr: arrays, chunks, shards, codecs, commit."""
+"""The arrays and metadata of one run as a Zarr group: read, write, commit."""
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
-import math
 import os
 import shutil
 from pathlib import Path
@@ -12,17 +12,19 @@ from typing import Any
 
 import numpy as np
 import zarr
-from zarr.abc.store import ByteRequest
-from zarr.codecs import BloscCodec, Crc32cCodec, ShardingCodecIndexLocation
-from zarr.core.array import ShardsConfigParam
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import LocalStore
+from zarr.abc.store import (
+    ByteRequest,
+    OffsetByteRequest,
+    RangeByteRequest,
+    SuffixByteRequest,
+)
+from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.storage import LocalStore, MemoryStore
 
-from weighttraj.errors import DamageError, FormatError, StoreExistsError
+from weighttraj.errors import DamageError, FormatError, MissingExtraError, StoreExistsError
+from weighttraj.format.codecs import check_array, create_array, quiet_codecs
+from weighttraj.format.objects import FolderObjects, Objects, ZipObjects
 from weighttraj.format.schema import ArraySpec, RunInfo, arrays_of, load_json, parse, to_json
-
-MAX_CHUNK_PARAMS = 16_384
-"""Columns in a chunk. Wider arrays are sharded: one file a block, each chunk read on its own."""
 
 # Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
 _EMPTY_CHUNKS = {"array.write_empty_chunks": True}
@@ -31,48 +33,128 @@ ATTRIBUTE = "weighttraj"
 """Key of the run's metadata in the attributes of its Zarr group."""
 
 CHECKSUM = "weighttraj_sha256"
-"""Key of the metadata's checksum."""
+"""Key of the checksum of the group's metadata."""
 
+PACKED = ".zip"
+"""Ending of a run that lies in one file."""
 
-class _CommittedStore(LocalStore):
-    """A store in which every chunk must exist.
-
-    Plain Zarr reads a missing chunk as fill value. All chunks of committed rows are written, even
-    empty ones, so here a missing chunk is damage.
-    """
-
-    async def get(
-        self,
-        key: str,
-        prototype: BufferPrototype | None = None,
-        byte_range: ByteRequest | None = None,
-    ) -> Buffer | None:
-        value = await super().get(key, prototype, byte_range)
-        if value is None and "/c/" in key:
-            raise DamageError(
-                "committed data is missing",
-                expected=f"the object {key}",
-                got="no such object",
-                where=self.root,
-                do="restore the file from a copy, or collect the run again from its seed",
-            )
-        return value
+Documents = dict[str, dict[str, Any]]
+"""Zarr metadata of each array, by name."""
 
 
 class RunStore:
-    """The arrays and metadata of one run on disk."""
+    """The arrays and metadata of one run, to be read; in a folder or in one zip file."""
 
-    def __init__(self, path: Path, info: RunInfo) -> None:
-        self.path = path
+    def __init__(self, objects: Objects, info: RunInfo, documents: Documents) -> None:
+        self.objects = objects
         self.info = info
         self.specs = arrays_of(info)
-        self._unsynced: set[Path] = set()
+        self.documents = documents
         self._readable: dict[str, zarr.Array[Any]] = {}
+
+    @property
+    def path(self) -> Path:
+        """Where the run lies."""
+        return self.objects.path
+
+    @classmethod
+    def open(cls, path: Path) -> RunStore:
+        """Open an existing run.
+
+        Raises:
+            FileNotFoundError: there is no run at the path.
+            FormatError: it is no run of this format.
+        """
+        objects = objects_at(path)
+        return cls(objects, *read_metadata(objects))
+
+    def read(self, name: str, key: Any) -> np.ndarray:
+        """Read part of an array; ``key`` as numpy takes it, within the committed rows.
+
+        Raises:
+            DamageError: a chunk is missing, or its checksum is wrong.
+        """
+        array = self._array(name)
+        key = key if isinstance(key, tuple) else (key,)
+        by_column = array.ndim == 2 and array.metadata.dimension_names[0] != self.specs[name].axis  # type: ignore[union-attr, index]
+        self._require(name, array, key[0], axis=1 if by_column else 0)
+        if by_column:
+            key = (key[1] if len(key) > 1 else slice(None), key[0])
+        where = f"{self.path}, array {name!r}, selection {key!r}"
+        basic = all(isinstance(part, int | slice) for part in key)
+        try:
+            values = np.asarray(array[key] if basic else array.oindex[key])
+        except FormatError:
+            raise
+        except MemoryError as error:
+            raise FormatError(
+                "this selection does not fit into memory",
+                got=error,
+                where=where,
+                do="read fewer rows at a time",
+            ) from error
+        # Codecs raise what they like; pco's errors are bare RuntimeErrors.
+        except Exception as error:
+            raise DamageError(
+                "committed data cannot be decoded",
+                expected="chunks whose crc32c matches",
+                got=error,
+                where=where,
+                do="restore the array's files from a copy, or collect the run again",
+            ) from error
+        return np.ascontiguousarray(values.T) if by_column else values
+
+    def chunk_rows(self, name: str) -> int:
+        """Rows in a chunk (or shard) of an array: the unit in which it is read or written."""
+        axis = self.documents[name]["dimension_names"].index(self.specs[name].axis)
+        return int(self.documents[name]["chunk_grid"]["configuration"]["chunk_shape"][axis])
+
+    def _require(self, name: str, array: zarr.Array[Any], rows: Any, axis: int) -> None:
+        """Every chunk of the rows must exist: plain Zarr would read fill values, and allocate."""
+        size = self.chunk_rows(name)
+        n = array.shape[axis]
+        if isinstance(rows, slice):
+            start, stop, _ = rows.indices(n)
+            chunks = range(start // size, -(-stop // size)) if stop > start else range(0)
+        else:
+            chunks = np.unique(np.atleast_1d(rows) // size).tolist()
+        for chunk in chunks:
+            index = [0] * array.ndim
+            index[axis] = chunk
+            key = "/".join([name, "c", *map(str, index)])
+            if not self.objects.exists(key):
+                raise _missing(key, self.path)
+
+    def _array(self, name: str) -> zarr.Array[Any]:
+        if name not in self._readable:
+            store = _CommittedStore(self.objects, name, self.documents[name])
+            self._readable[name] = _open_array(store, name, "r", str(self.path))
+        return self._readable[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_readable": {}}
+
+
+class LiveStore(RunStore):
+    """A run in a folder, to be written."""
+
+    objects: FolderObjects
+
+    def __init__(self, objects: FolderObjects, info: RunInfo, documents: Documents) -> None:
+        super().__init__(objects, info, documents)
+        self._unsynced: set[Path] = set()
         self._writable: dict[str, zarr.Array[Any]] = {}
 
     @classmethod
-    def create(cls, path: Path, info: RunInfo) -> RunStore:
+    def create(
+        cls, path: Path, info: RunInfo, packed_rows: dict[str, int] | None = None
+    ) -> LiveStore:
         """Make an empty store; it appears under its name all at once.
+
+        Args:
+            path: folder to be made.
+            info: metadata.
+            packed_rows: rows of each axis in a run that is about to be packed.
 
         Raises:
             StoreExistsError: the path exists.
@@ -89,62 +171,57 @@ class RunStore:
         draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
         shutil.rmtree(draft, ignore_errors=True)
         group = zarr.create_group(LocalStore(draft))
-        for spec in arrays_of(info).values():
-            _create_array(group, spec, info.block)
-        store = cls(draft, info)
+        documents = {}
+        for name, spec in arrays_of(info).items():
+            rows = packed_rows[spec.axis] if packed_rows else None
+            create_array(group, spec, info.profile, info.block, rows)
+            documents[name] = json.loads((draft / name / "zarr.json").read_bytes())
+        store = cls(FolderObjects(draft), info, documents)
         store.commit(info)
         draft.rename(path)
-        _sync(path.parent)
-        store.path = path
+        sync(path.parent)
+        store.objects = FolderObjects(path)
         return store
 
     @classmethod
-    def open(cls, path: Path) -> RunStore:
-        """Open an existing store.
+    def open(cls, path: Path) -> LiveStore:
+        """Open a folder for writing. Rows that were written but not committed are forgotten.
 
         Raises:
             FileNotFoundError: there is no run at the path.
-            FormatError: it is no run of this format.
+            FormatError: it is no run of this format, or it is packed.
         """
-        return cls(path, read_info(path))
-
-    def read(self, name: str, key: Any) -> np.ndarray:
-        """Read part of an array; ``key`` as numpy takes it, within the committed rows.
-
-        Raises:
-            DamageError: a chunk is missing, or its checksum is wrong.
-        """
-        try:
-            if name not in self._readable:
-                self._readable[name] = self._open_array(name, _CommittedStore(self.path))
-            return np.asarray(self._readable[name].oindex[key])
-        except FormatError:
-            raise
-        except (ValueError, RuntimeError, OSError) as error:
-            raise DamageError(
-                "committed data cannot be decoded",
-                expected="chunks whose crc32c matches",
-                got=error,
-                where=f"{self.path}, array {name!r}, selection {key!r}",
-                do="restore the array's files from a copy, or collect the run again",
-            ) from error
+        if path.name.endswith(PACKED):
+            raise FormatError("a packed run is finished; nothing can be added", where=path)
+        objects = FolderObjects(path)
+        store = cls(objects, *read_metadata(objects))
+        store.trim()
+        return store
 
     def write(self, name: str, start: int, values: np.ndarray) -> None:
-        """Write rows of an array from ``start`` on, which begins a block; nothing is committed.
+        """Write rows of an array from ``start`` on, which begins a chunk; nothing is committed.
 
         Every chunk is written whole and replaced atomically, then read back and compared.
 
         Raises:
             DamageError: what was read back is not what was written.
         """
-        array = self._writable_array(name)
+        if name not in self._writable:
+            self._writable[name] = _open_array(LocalStore(self.path), name, "r+", str(self.path))
+        array = self._writable[name]
         stop = start + len(values)
-        if array.shape[0] < stop:
-            array.resize((stop, *array.shape[1:]))
         values = np.ascontiguousarray(values, array.dtype)
-        array[start:stop] = values
+        rows: Any = slice(start, stop)
+        if array.metadata.dimension_names[0] != self.specs[name].axis:  # type: ignore[union-attr, index]
+            if array.shape[1] < stop:
+                array.resize((array.shape[0], stop))
+            rows = (slice(None), rows)
+            values = np.ascontiguousarray(values.T)
+        elif array.shape[0] < stop:
+            array.resize((stop, *array.shape[1:]))
+        array[rows] = values
         self._unsynced |= self._files(name, start, stop)
-        if np.asarray(array[start:stop]).tobytes() != values.tobytes():
+        if np.asarray(array[rows]).tobytes() != values.tobytes():
             raise DamageError(
                 "what was written reads back as something else",
                 where=f"{self.path}, array {name!r}, rows {start} to {stop}",
@@ -157,105 +234,171 @@ class RunStore:
         What was written before is on the disk first, so that a power cut finds it there.
         """
         for path in self._unsynced:
-            _sync(path)
+            sync(path)
         self._unsynced.clear()
-        metadata = to_json(info)
-        attributes = {ATTRIBUTE: metadata, CHECKSUM: checksum(metadata)}
-        document = {"zarr_format": 3, "node_type": "group", "attributes": attributes}
-        replace_file(self.path / "zarr.json", json.dumps(document, indent=1).encode())
-        self.info = info
-
-    def _files(self, name: str, start: int, stop: int) -> set[Path]:
-        """Files and folders that hold some rows of an array."""
-        blocks = range(start // self.info.block, -(-stop // self.info.block))
-        inner = "/0" * len(self.specs[name].inner)
-        names = [f"{name}/zarr.json", *(f"{name}/c/{block}{inner}" for block in blocks)]
-        folders = {self.path / parent for file in names for parent in Path(file).parents}
-        return folders | {self.path / file for file in names}
+        documents = copy.deepcopy(self.documents)
+        for name, spec in self.specs.items():
+            axis = documents[name]["dimension_names"].index(spec.axis)
+            documents[name]["shape"][axis] = info.committed(spec.axis)
+        replace_file(self.path / "zarr.json", group_document(info, documents))
+        self.info, self.documents = info, documents
 
     def trim(self) -> None:
         """Cut the arrays to the committed rows, so that plain Zarr shows nothing else."""
-        for name, spec in self.specs.items():
-            array = self._writable_array(name)
-            rows = self.info.committed(spec.axis)
-            if array.shape[0] > rows:
-                array.resize((rows, *array.shape[1:]))
-                _sync(self.path / name / "zarr.json")
+        for name, content in member_documents(self.documents).items():
+            file = self.path / name
+            if not file.is_file() or file.read_bytes() != content:
+                replace_file(file, content)
+        self._writable.clear()
 
-    def _writable_array(self, name: str) -> zarr.Array[Any]:
-        if name not in self._writable:
-            self._writable[name] = self._open_array(name, LocalStore(self.path))
-        return self._writable[name]
-
-    def _open_array(self, name: str, store: LocalStore) -> zarr.Array[Any]:
-        spec = self.specs[name]
-        where = f"{self.path}, array {spec.name!r}"
-        try:
-            with zarr.config.set(_EMPTY_CHUNKS):
-                array = zarr.open_array(store, path=name, mode="r+", zarr_format=3)
-        except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
-            raise DamageError(
-                "the metadata of an array is missing or damaged",
-                got=error,
-                where=where,
-                do="restore its zarr.json from a copy",
-            ) from error
-        rows = self.info.committed(spec.axis)
-        expected = (f"at least {rows} rows of {spec.inner}", spec.dtype)
-        if array.shape[1:] != spec.inner or array.dtype != spec.dtype or array.shape[0] < rows:
-            raise FormatError(
-                "an array is not what the run's metadata says",
-                expected=expected,
-                got=(array.shape, str(array.dtype)),
-                where=where,
-                do="restore the run from a copy",
-            )
-        return array
+    def _files(self, name: str, start: int, stop: int) -> set[Path]:
+        """Files and folders that hold some rows of an array."""
+        folder = self.path / name
+        if self.documents[name]["dimension_names"][0] == self.specs[name].axis:
+            size, inner = self.chunk_rows(name), "/0" * len(self.specs[name].inner)
+            chunks = range(start // size, -(-stop // size))
+            files = [folder / f"c/{chunk}{inner}" for chunk in chunks]
+            files = [file for file in files if file.exists()]
+        else:
+            files = [file for file in folder.rglob("*") if file.is_file()]
+        files.append(folder / "zarr.json")
+        root = len(self.path.parts)
+        parents = {Path(*f.parts[:n]) for f in files for n in range(root, len(f.parts))}
+        return {*files, *parents}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_readable": {}, "_writable": {}}
+        return {**super().__getstate__(), "_writable": {}}
+
+
+class _CommittedStore(MemoryStore):
+    """One array as Zarr sees it: checked metadata from memory, chunks from where they are.
+
+    Plain Zarr reads a missing chunk as fill value. All chunks of committed rows are written, even
+    empty ones, so here a missing chunk is damage.
+    """
+
+    def __init__(self, objects: Objects, name: str, document: dict[str, Any]) -> None:
+        content = default_buffer_prototype().buffer.from_bytes(array_document(document))
+        super().__init__({f"{name}/zarr.json": content}, read_only=True)
+        self._objects = objects
+
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        if "/c/" not in key:
+            return await super().get(key, prototype, byte_range)
+        start, stop = 0, None
+        if isinstance(byte_range, RangeByteRequest):
+            start, stop = byte_range.start, byte_range.end
+        elif isinstance(byte_range, OffsetByteRequest):
+            start = byte_range.offset
+        elif isinstance(byte_range, SuffixByteRequest):
+            start = -byte_range.suffix
+        value = self._objects.read(key, start, stop)
+        if value is None:
+            raise _missing(key, self._objects.path)
+        return (prototype or default_buffer_prototype()).buffer.from_bytes(value)
+
+
+def objects_at(path: Path) -> FolderObjects | ZipObjects:
+    """The objects of a run in a folder or in a zip file.
+
+    Raises:
+        FileNotFoundError: there is none.
+        FormatError: it is a file, but no packed run.
+    """
+    if path.is_file():
+        return ZipObjects(path)
+    if not (path / "zarr.json").is_file():
+        raise FileNotFoundError(f"no run at {path}: it has no zarr.json")
+    return FolderObjects(path)
 
 
 def read_info(path: Path) -> RunInfo:
     """Metadata of the run at a path; raises as ``RunStore.open`` does."""
-    file = path / "zarr.json"
-    if not file.is_file():
-        raise FileNotFoundError(f"no run at {path}: it has no zarr.json")
-    document = load_json(file.read_bytes(), file)
+    return read_metadata(objects_at(path))[0]
+
+
+def read_metadata(objects: Objects) -> tuple[RunInfo, Documents]:
+    """The checked metadata of a run and of its arrays.
+
+    Raises:
+        FormatError: it is no run of this format, or asks for what no reader should do.
+        DamageError: it does not match its checksum.
+    """
+    where = f"{objects.path}, zarr.json"
+    document = load_json(objects.read("zarr.json") or b"", where)
     attributes = document.get("attributes") if isinstance(document, dict) else None
     if not isinstance(attributes, dict) or ATTRIBUTE not in attributes:
         raise FormatError(
             "this Zarr store is no run of weighttraj",
             expected=f"a group with the attribute {ATTRIBUTE!r}",
             got="none",
-            where=path,
-            do="open a run's folder, <data set>/runs/<id>.zarr",
+            where=objects.path,
+            do="open a run, <data set>/runs/<id>.zarr",
         )
-    metadata = attributes[ATTRIBUTE]
-    info = parse(metadata, RunInfo, file)
-    if attributes.get(CHECKSUM) != checksum(metadata):
+    info = parse(attributes[ATTRIBUTE], RunInfo, where)
+    stored = attributes.pop(CHECKSUM, None)
+    if stored != checksum(document):
         raise DamageError(
             "the metadata does not match its checksum",
-            expected=attributes.get(CHECKSUM),
-            got=checksum(metadata),
-            where=file,
+            expected=stored,
+            got=checksum(document),
+            where=where,
             do="restore the file from a copy",
         )
-    return info
+    try:
+        documents = document["consolidated_metadata"]["metadata"]
+        documents = {name: documents[name] for name in arrays_of(info)}
+    except (KeyError, TypeError) as error:
+        raise FormatError(
+            "the metadata lacks an array that the run has", got=error, where=where
+        ) from error
+    for name, spec in arrays_of(info).items():
+        check_array(spec, documents[name], info.committed(spec.axis), f"{objects.path}, {name}")
+    return info, documents
+
+
+def group_document(info: RunInfo, documents: Documents) -> bytes:
+    """``zarr.json`` of a run's group, with the metadata of its arrays and the checksum."""
+    document = {
+        "zarr_format": 3,
+        "node_type": "group",
+        "attributes": {ATTRIBUTE: to_json(info)},
+        "consolidated_metadata": {
+            "kind": "inline",
+            "must_understand": False,
+            "metadata": {**_groups(documents), **documents},
+        },
+    }
+    document["attributes"] |= {CHECKSUM: checksum(document)}  # type: ignore[operator]
+    return json.dumps(document, indent=1).encode()
+
+
+def array_document(document: dict[str, Any]) -> bytes:
+    """``zarr.json`` of an array."""
+    return json.dumps(document, indent=2).encode()
+
+
+def member_documents(documents: Documents) -> dict[str, bytes]:
+    """Every ``zarr.json`` below a run's group, by path, as the group's metadata says it."""
+    nodes = {**_groups(documents), **documents}
+    return {f"{name}/zarr.json": array_document(node) for name, node in nodes.items()}
+
+
+def _groups(documents: Documents) -> Documents:
+    """The groups between a run and its arrays: they hold nothing of their own."""
+    names = sorted({name.rpartition("/")[0] for name in documents} - {""})
+    return {name: {"attributes": {}, "zarr_format": 3, "node_type": "group"} for name in names}
 
 
 def checksum(metadata: Any) -> str:
     """SHA-256 of metadata as JSON with sorted keys and no spaces."""
     text = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -266,32 +409,45 @@ def replace_file(path: Path, content: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     draft.replace(path)
-    _sync(path.parent)
+    sync(path.parent)
 
 
-def _create_array(group: zarr.Group, spec: ArraySpec, block: int) -> None:
-    width = math.prod(spec.inner)
-    chunks: tuple[int, ...] = (block, *spec.inner)
-    shards: ShardsConfigParam | None = None
-    if len(spec.inner) == 1 and width > MAX_CHUNK_PARAMS:
-        columns = -(-width // MAX_CHUNK_PARAMS) * MAX_CHUNK_PARAMS
-        chunks = (block, MAX_CHUNK_PARAMS)
-        # The index comes first: plain HTTP servers answer no request for a suffix.
-        shards = ShardsConfigParam(
-            shape=(block, columns), index_location=ShardingCodecIndexLocation.start
-        )
-    itemsize = np.dtype(spec.dtype).itemsize
-    group.create_array(
-        spec.name,
-        shape=(0, *spec.inner),
-        dtype=spec.dtype,
-        chunks=chunks,
-        shards=shards,
-        # Without the checksum no bit flip in a compressed chunk is noticed.
-        compressors=(
-            BloscCodec(cname="zstd", clevel=5, shuffle="shuffle", typesize=itemsize),
-            Crc32cCodec(),
-        ),
-        fill_value=spec.fill,
-        dimension_names=spec.dims,
+def sync(path: Path) -> None:
+    """See a file or folder on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _missing(key: str, where: object) -> DamageError:
+    return DamageError(
+        "committed data is missing",
+        expected=f"the object {key}",
+        got="no such object",
+        where=where,
+        do="restore the file from a copy, or collect the run again from its seed",
     )
+
+
+def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:
+    try:
+        with zarr.config.set(_EMPTY_CHUNKS), quiet_codecs():
+            return zarr.open_array(store, path=name, mode=mode, zarr_format=3)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"the archive profile needs {error.name}, which is not installed",
+            where=where,
+            do="pip install 'numcodecs[pcodec]'",
+        ) from error
+    except Exception as error:  # Zarr has no error of its own for metadata it cannot parse
+        raise DamageError(
+            "the metadata of an array is damaged",
+            got=repr(error),
+            where=f"{where}, array {name!r}",
+            do="restore the run from a copy",
+        ) from error
+
+
+__all__ = ["ArraySpec", "LiveStore", "RunStore", "read_info", "replace_file"]

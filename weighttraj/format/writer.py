@@ -15,7 +15,7 @@ from jaxtyping import Float32
 
 from weighttraj.errors import FormatError, ReplayError, SnapshotError, StoreLockedError
 from weighttraj.format.schema import AXES, ArraySpec, Axis, RunInfo, Status, to_json, with_progress
-from weighttraj.format.storage import RunStore
+from weighttraj.format.storage import LiveStore
 
 Moments = tuple[np.ndarray, np.ndarray, float]
 """Statistics of a normaliser: mean, variance, count."""
@@ -52,7 +52,7 @@ class RunWriter:
             if resume and path.exists():
                 self._store = _reopen(path, info)
             else:
-                self._store = RunStore.create(path, with_progress(info, **_NOTHING))
+                self._store = LiveStore.create(path, with_progress(info, **_NOTHING))
         except BaseException:
             self._lock.release()
             raise
@@ -251,8 +251,8 @@ def _lock(path: Path) -> FileLock:
     return lock
 
 
-def _reopen(path: Path, info: RunInfo) -> RunStore:
-    store = RunStore.open(path)
+def _reopen(path: Path, info: RunInfo) -> LiveStore:
+    store = LiveStore.open(path)
     old = store.info
     if old.status == "complete":
         raise FormatError(
@@ -273,7 +273,7 @@ def _reopen(path: Path, info: RunInfo) -> RunStore:
     return store
 
 
-_MAY_DIFFER = ("status", "n_committed", "n_committed_iterations", "provenance")
+_MAY_DIFFER = ("status", "n_committed", "n_committed_iterations", "provenance", "profile")
 
 
 def _moments(name: str, moments: Moments | None) -> dict[str, Any]:

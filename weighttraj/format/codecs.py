@@ -1,0 +1,166 @@
+"""How the arrays of a run are chunked and encoded, and which encodings a reader accepts."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec, ShardingCodecIndexLocation
+from zarr.codecs.numcodecs import PCodec
+from zarr.core.array import ShardsConfigParam
+from zarr.errors import ZarrUserWarning
+
+from weighttraj.errors import DamageError, FormatError
+from weighttraj.format.schema import ArraySpec, Profile
+
+MAX_CHUNK_PARAMS = 16_384
+"""Columns in a chunk. While a run is collected, wider arrays are sharded: one file a block."""
+
+PACKED_CHUNK_BYTES = 4 << 20
+"""Decoded bytes in a chunk of a packed run, about."""
+
+MAX_CHUNK_BYTES = 1 << 30
+"""Decoded bytes in a chunk that a reader accepts: more could be there to fill the memory."""
+
+KNOWN_CODECS = frozenset(
+    {"bytes", "transpose", "blosc", "gzip", "zstd", "crc32c", "sharding_indexed"}
+    | {"numcodecs.pcodec"}
+)
+"""Codecs that a reader accepts."""
+
+
+def create_array(
+    group: zarr.Group, spec: ArraySpec, profile: Profile, block: int, packed_rows: int | None
+) -> None:
+    """Create an empty array in a run's group.
+
+    Args:
+        group: the run's group.
+        spec: the array.
+        profile: ``default`` encodes by core codecs, row by row; ``archive`` by PCodec, parameter
+            by parameter.
+        block: rows of a chunk while the run is collected.
+        packed_rows: rows the array will have in a packed run; None: the run is being collected.
+    """
+    by_column = profile == "archive" and len(spec.inner) == 1 and spec.dtype != "uint8"
+    if packed_rows is None:
+        rows, columns = block, spec.inner
+    else:
+        rows, columns = _packed_chunk(spec, packed_rows, by_column)
+    chunks: tuple[int, ...] = (rows, *columns)
+    shards: ShardsConfigParam | None = None
+    if packed_rows is None and len(spec.inner) == 1 and spec.inner[0] > MAX_CHUNK_PARAMS:
+        chunks = (block, MAX_CHUNK_PARAMS)
+        width = -(-spec.inner[0] // MAX_CHUNK_PARAMS) * MAX_CHUNK_PARAMS
+        # The index comes first: plain HTTP servers answer no request for a suffix.
+        shards = ShardsConfigParam(
+            shape=(block, width), index_location=ShardingCodecIndexLocation.start
+        )
+    shape, dims = (0, *spec.inner), spec.dims
+    if by_column:  # PCodec sees no strides: the order must be the array's own
+        shape, dims, chunks = shape[::-1], dims[::-1], chunks[::-1]
+    with quiet_codecs():
+        group.create_array(
+            spec.name,
+            shape=shape,
+            dtype=spec.dtype,
+            chunks=chunks,
+            shards=shards,
+            fill_value=spec.fill,
+            dimension_names=dims,
+            **_codecs(spec, profile, by_column),
+        )
+
+
+def check_array(spec: ArraySpec, document: Any, rows: int, where: str) -> None:
+    """Accept the metadata of an array, or refuse it before anything is decoded or allocated.
+
+    Raises:
+        FormatError: it is another array than the run says, or has codecs or chunks that no
+            reader should meet.
+    """
+    try:
+        dims = tuple(document["dimension_names"])
+        shape, inner = (rows, *spec.inner), document["chunk_grid"]["configuration"]["chunk_shape"]
+        if dims == spec.dims[::-1] and len(dims) == 2:
+            shape, dims = shape[::-1], dims[::-1]
+        got = (tuple(document["shape"]), document["data_type"], dims)
+        expected = (shape, spec.dtype, spec.dims)
+        if got != expected or document["node_type"] != "array":
+            raise FormatError(
+                "an array is not what the run's metadata says",
+                expected=expected,
+                got=got,
+                where=where,
+                do="restore the run from a copy",
+            )
+        plain = (
+            document["chunk_grid"]["name"] == "regular"
+            and document["chunk_key_encoding"]
+            == {"name": "default", "configuration": {"separator": "/"}}
+            and not document.get("storage_transformers")
+        )
+        size = math.prod(inner) * np.dtype(spec.dtype).itemsize
+        small = len(inner) == len(shape) and min(inner) > 0 and size <= MAX_CHUNK_BYTES
+        unknown = sorted(set(_codec_names(document["codecs"])) - KNOWN_CODECS)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise DamageError(
+            "the metadata of an array is damaged",
+            got=repr(error),
+            where=where,
+            do="restore the run from a copy",
+        ) from error
+    if unknown or not (plain and small):
+        raise FormatError(
+            "refused: an array is encoded in a way that this format does not have",
+            expected=f"codecs among {sorted(KNOWN_CODECS)}, chunks of at most "
+            f"{MAX_CHUNK_BYTES} bytes on a regular grid",
+            got=f"codecs {unknown}" if unknown else f"chunks {inner}",
+            where=where,
+            do="do not use data from a source that you do not trust",
+        )
+
+
+@contextmanager
+def quiet_codecs() -> Iterator[None]:
+    """Without Zarr's warning that PCodec is in no specification: FORMAT.md says so."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Numcodecs codecs are not in", ZarrUserWarning)
+        yield
+
+
+def _packed_chunk(spec: ArraySpec, rows: int, by_column: bool) -> tuple[int, tuple[int, ...]]:
+    """Rows and columns of a chunk of about 4 MiB; as many rows as fit."""
+    itemsize = np.dtype(spec.dtype).itemsize
+    columns = spec.inner
+    if len(columns) == 1:
+        columns = (min(columns[0], MAX_CHUNK_PARAMS // (2 if by_column else 1)),)
+    fitting = PACKED_CHUNK_BYTES // (itemsize * max(1, math.prod(columns)))
+    return max(1, min(rows, fitting)), columns
+
+
+def _codecs(spec: ArraySpec, profile: Profile, by_column: bool) -> dict[str, Any]:
+    # Crc32c last: without it no bit flip in a compressed chunk is noticed.
+    if profile == "archive" and spec.dtype != "uint8":
+        delta = {"delta_spec": "try_consecutive", "delta_encoding_order": 1} if by_column else {}
+        return {
+            "serializer": PCodec(level=8, mode_spec="classic", **delta),
+            "compressors": (Crc32cCodec(),),
+        }
+    itemsize = np.dtype(spec.dtype).itemsize
+    blosc = BloscCodec(cname="zstd", clevel=5, shuffle="shuffle", typesize=itemsize)
+    return {"compressors": (blosc, Crc32cCodec())}
+
+
+def _codec_names(codecs: list[dict[str, Any]]) -> Iterator[str]:
+    for codec in codecs:
+        yield codec["name"]
+        inner = codec.get("configuration", {})
+        yield from _codec_names([*inner.get("codecs", []), *inner.get("index_codecs", [])])

@@ -1,0 +1,110 @@
+"""A finished run as one file: fewer objects, larger chunks, and the ``archive`` profile."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from weighttraj.errors import FormatError
+from weighttraj.format.objects import ZipObjects, write_zip
+from weighttraj.format.schema import AXES, Profile
+from weighttraj.format.storage import PACKED, LiveStore, RunStore, sync
+
+
+def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | None = None) -> Path:
+    """Pack a finished run into one zip file, chunk by chunk; the run itself stays.
+
+    Every chunk is read back and compared before the file appears under its name.
+
+    Args:
+        path: run to be packed; a packed one is packed again.
+        profile: ``default``: core codecs, readable by any Zarr v3 library; ``archive``: smallest,
+            lossless too, needs PCodec (which comes with this package).
+        out: file to be written; default: the run's path and ``.zip``. It is replaced.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileNotFoundError: there is no run at the path.
+        FormatError: the run is still being collected.
+    """
+    source = RunStore.open(Path(path))
+    if source.info.status == "collecting":
+        raise FormatError(
+            "only a finished run can be packed",
+            expected="status complete or crashed",
+            got=source.info.status,
+            where=path,
+            do="finish collecting it first",
+        )
+    target = Path(out or str(path).removesuffix(PACKED) + PACKED)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        live = LiveStore.create(
+            Path(folder) / "run.zarr",
+            replace(source.info, n_committed=0, n_committed_iterations=0, profile=profile),
+            {axis: source.info.committed(axis) for axis in AXES},
+        )
+        for name, spec in source.specs.items():
+            rows, step = source.info.committed(spec.axis), live.chunk_rows(name)
+            for start in range(0, rows, step):
+                live.write(name, start, source.read(name, slice(start, min(start + step, rows))))
+        live.commit(replace(source.info, profile=profile))
+        live.trim()
+        draft = Path(folder) / "run.zip"
+        write_zip(draft, _members(live.path))
+        sync(draft)
+        draft.replace(target)
+    sync(target.parent)
+    return target
+
+
+def same_as_packed(path: Path) -> bool:
+    """Whether a packed run is, to the last byte, what packing its own members gives.
+
+    So every byte counts, also those of the zip file's directory that no reader looks at.
+    """
+    objects = ZipObjects(path)
+    with tempfile.TemporaryDirectory() as folder:
+        members = [(n, Path(folder) / str(i)) for i, n in enumerate(objects.names)]
+        for name, file in members:
+            file.write_bytes(objects.read(name) or b"")
+        again = Path(folder) / "again.zip"
+        write_zip(again, members)
+        return _equal(path, again)
+
+
+@contextlib.contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """A packed run as a folder beside it, for as long as the context lasts."""
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        objects = ZipObjects(path)
+        for name in objects.names:
+            file = Path(folder) / "run.zarr" / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(objects.read(name) or b"")
+        yield Path(folder) / "run.zarr"
+
+
+def _members(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Files of a run in a fixed order, its metadata first."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    for file in sorted(files, key=lambda file: file.name != "zarr.json"):
+        yield file.relative_to(folder).as_posix(), file
+
+
+def _equal(one: Path, other: Path) -> bool:
+    if os.path.getsize(one) != os.path.getsize(other):
+        return False
+    with one.open("rb") as a, other.open("rb") as b:
+        while piece := a.read(1 << 22):
+            if piece != b.read(len(piece)):
+                return False
+    return True
+
+
+__all__ = ["pack", "same_as_packed", "unpacked"]
