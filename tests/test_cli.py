@@ -34,7 +34,7 @@ def test_help_teaches(arguments: tuple[str, ...]) -> None:
 
 def test_show_and_verify(small_dataset: Path) -> None:
     assert "4 runs" in run("weighttraj", "show", small_dataset).stdout
-    shown = run("weighttraj", "show", small_dataset / "runs/seed0000.zarr").stdout
+    shown = run("weighttraj", "show", small_dataset / "runs/seed0000.zarr.zip").stdout
     assert "<policy/weights float32 {'time': 49, 'param': 122}>" in shown
     done = run("weighttraj", "verify", small_dataset)
     assert (done.returncode, done.stdout.strip()) == (0, f"{small_dataset}: whole")
@@ -47,6 +47,7 @@ def test_verify_fails_on_damage(tmp_path: Path) -> None:
     (tmp_path / "r.zarr/policy/weights/c/0/0").unlink()
     done = run("weighttraj", "verify", tmp_path / "r.zarr")
     assert done.returncode == 1
+    assert "policy/weights/c/0/0: missing" in done.stdout
     assert "expected: the object policy/weights/c/0/0" in done.stdout
 
 

@@ -20,32 +20,71 @@ ALLOWED = {
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
     "weighttraj.format.objects": ["weighttraj.errors"],
     "weighttraj.format.codecs": ["weighttraj.errors", "weighttraj.format.schema"],
+    "weighttraj.format.decode": ["weighttraj.errors", "weighttraj.format.objects"],
     "weighttraj.format.storage": [
+        "weighttraj.errors",
+        "weighttraj.format.codecs",
+        "weighttraj.format.decode",
+        "weighttraj.format.objects",
+        "weighttraj.format.schema",
+    ],
+    "weighttraj.format.live": [
         "weighttraj.errors",
         "weighttraj.format.codecs",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
+        "weighttraj.format.storage",
     ],
     "weighttraj.format.packing": [
         "weighttraj.errors",
+        "weighttraj.format.live",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
     ],
     "weighttraj.format.writer": [
         "weighttraj.errors",
+        "weighttraj.format.live",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
     ],
+    "weighttraj.format.catalog": [
+        "weighttraj.errors",
+        "weighttraj.format.objects",
+        "weighttraj.format.schema",
+        "weighttraj.format.storage",
+    ],
+    "weighttraj.format.tables": [
+        "weighttraj.errors",
+        "weighttraj.format.objects",
+        "weighttraj.format.reader",
+    ],
+    "weighttraj.format.lint": ["weighttraj.format.reader"],
     "weighttraj.format.reader": [
         "weighttraj.errors",
+        "weighttraj.format.catalog",
         "weighttraj.format.layout",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
+        "later weighttraj.format.hdf5",
         "later weighttraj.load.windows",
         "later weighttraj.policies.policy",
     ],
-    "weighttraj.format.integrity": ["weighttraj.errors", "weighttraj.format.reader"],
+    "weighttraj.format.export": [
+        "weighttraj.errors",
+        "weighttraj.format.objects",
+        "weighttraj.format.reader",
+        "weighttraj.format.schema",
+    ],
+    "weighttraj.format.hdf5_store": [
+        "weighttraj.errors",
+        "weighttraj.format.codecs",
+        "weighttraj.format.objects",
+        "weighttraj.format.schema",
+        "weighttraj.format.storage",
+    ],
+    "weighttraj.format.hdf5": [FORMAT, "weighttraj.errors"],
+    "weighttraj.format.integrity": [FORMAT, "weighttraj.errors"],
     "weighttraj.format": [FORMAT],
     "weighttraj.environments": ["weighttraj.errors"],
     "weighttraj.collect": [
@@ -60,7 +99,18 @@ ALLOWED = {
         FORMAT,
         "weighttraj.policies",
     ],
-    "weighttraj.load": ["weighttraj.errors", FORMAT, "weighttraj.load"],
+    "weighttraj.load.cache": [
+        "weighttraj.errors",
+        "door weighttraj.format",
+        "weighttraj.format.objects",
+    ],
+    "weighttraj.load.windows": [
+        "weighttraj.errors",
+        "door weighttraj.format",
+        "weighttraj.load.cache",
+    ],
+    "weighttraj.load.loader": ["weighttraj.errors", "weighttraj.load.windows"],
+    "weighttraj.load": ["weighttraj.errors", "weighttraj.load"],
     "weighttraj.cli": ["door weighttraj", "weighttraj.errors", "later weighttraj.collect.recipe"],
     "weighttraj": [FORMAT],
     "tipl.errors": ["weighttraj.errors"],
@@ -166,7 +216,16 @@ def run(code: str) -> str:
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, weighttraj; print([m for m in HEAVY if m in sys.modules])"
-    heavy = ["torch", "stable_baselines3", "gymnasium", "mujoco", "matplotlib", "pandas"]
+    heavy = [
+        "h5py",
+        "pyarrow",
+        "torch",
+        "stable_baselines3",
+        "gymnasium",
+        "mujoco",
+        "matplotlib",
+        "pandas",
+    ]
     assert run(f"HEAVY = {heavy}; {code}") == "[]"
 
 
@@ -190,6 +249,12 @@ except ImportError as error:
     [
         ("stable_baselines3", "wt.collect", "sb3"),
         ("torch", "wt.policies", "sb3"),
+        ("h5py", "from weighttraj.format import hdf5", "files"),
+        (
+            "safetensors",
+            "from weighttraj.format.export import export_safetensors as e; e(None, 0, '')",
+            "files",
+        ),
         ("torch", "wt.load", "sb3"),
         ("safetensors", "import tipl", "tipl"),
         ("jinja2", "import tipl", "tipl"),

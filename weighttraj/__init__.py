@@ -8,7 +8,7 @@ they are first named.
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
+from typing import Any
 
 from weighttraj.format import (
     Dataset,
@@ -16,8 +16,14 @@ from weighttraj.format import (
     Run,
     RunInfo,
     RunWriter,
+    export_npy,
+    export_safetensors,
+    lint,
     open_dataset,
     open_run,
+    pack,
+    repair,
+    seal,
     verify,
 )
 
@@ -32,18 +38,29 @@ __all__ = [
     "RunInfo",
     "RunWriter",
     "collect",
+    "export_hdf5",
+    "export_npy",
+    "export_safetensors",
+    "import_hdf5",
+    "lint",
     "load",
     "open",
     "open_dataset",
     "open_run",
+    "pack",
     "policies",
+    "repair",
+    "seal",
     "verify",
 ]
 
 _ROOMS = ("collect", "load", "policies")
+_HDF5 = ("export_hdf5", "import_hdf5")
 
 
-def __getattr__(name: str) -> ModuleType:
+def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return importlib.import_module(f"weighttraj.{name}")
+    if name in _HDF5:
+        return getattr(importlib.import_module("weighttraj.format.hdf5"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

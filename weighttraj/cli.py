@@ -6,7 +6,7 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -50,7 +50,7 @@ def _show(
     path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set or run")],
 ) -> None:
     """Print what a data set or a run holds."""
-    if (path / "dataset.json").is_file():
+    if (path / "dataset.json").is_file() or path.suffix == ".h5":
         print(wt.open(path))
         return
     run = wt.open_run(path)
@@ -59,15 +59,123 @@ def _show(
         print(f"  {array!r}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Verify:
+    path: tyro.conf.Positional[Path]
+    """Data set or run."""
+    deep: bool = False
+    """Decode every array, also where the manifest vouches for the bytes."""
+    replay: int = 0
+    """Train so many snapshots of a run again and compare them."""
+    seed: int | None = None
+    """Which run is trained again. Default: the first."""
+
+
 @app.command(name="verify")
-def _verify(
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _verify(args: _Verify) -> None:
+    """Is it whole? Exit with 1 if something is missing, damaged or not what it says."""
+    problems = wt.verify(args.path, deep=args.deep)
+    if args.replay and not problems:
+        problems += wt.collect.replay(args.path, args.replay, seed=args.seed)
+    _finish(args.path, problems, f"whole{_state_of(args.path)}")
+
+
+@app.command(name="lint")
+def _lint(
     path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set or run")],
 ) -> None:
-    """Read every byte of a data set or run; exit with 1 if something is missing or damaged."""
-    problems = wt.verify(path)
+    """Is it what it says it is? Look for duplicates, gaps, jumps; exit with 1 on findings."""
+    _finish(path, [str(finding) for finding in wt.lint(path)], "nothing suspicious")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Repair:
+    path: tyro.conf.Positional[Path]
+    """Data set or run."""
+    cut: bool = False
+    """Drop damaged snapshots and those after them; collecting again makes them anew."""
+
+
+@app.command(name="repair")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _repair(args: _Repair) -> None:
+    """Mend what can be mended without training, and say what is left to do."""
+    for step in wt.repair(args.path, cut=args.cut):
+        print(step)
+    _finish(args.path, wt.verify(args.path), f"whole{_state_of(args.path)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pack:
+    path: tyro.conf.Positional[Path]
+    """Finished run."""
+    profile: Literal["default", "archive"] = "default"
+    """``default``: any Zarr v3 reader; ``archive``: smallest, lossless too, needs PCodec."""
+    out: Path | None = None
+    """File to be written. Default: the run's path and .zip."""
+
+
+@app.command(name="pack")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _pack(args: _Pack) -> None:
+    """Write a finished run into one file; the run itself stays."""
+    print(wt.pack(args.path, profile=args.profile, out=args.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Export:
+    path: tyro.conf.Positional[Path]
+    """Run; for hdf5 also a data set."""
+    to: Literal["hdf5", "npy", "safetensors", "sb3"]
+    """hdf5: one file with everything; npy: weights.npy and tables; safetensors: one snapshot;
+    sb3: one snapshot as a model that PPO.load reads, and its VecNormalize."""
+    out: Path
+    """File (hdf5, safetensors) or folder (npy, sb3) to be written."""
+    t: int = -1
+    """Which snapshot. Default: the last."""
+
+
+@app.command(name="export")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _export(args: _Export) -> None:
+    """Write a run for other programs."""
+    if args.to == "hdf5":
+        print(wt.export_hdf5(args.path, args.out))
+        return
+    run = wt.open_run(args.path)
+    if args.to == "npy":
+        print(wt.export_npy(run, args.out))
+    elif args.to == "safetensors":
+        print(wt.export_safetensors(run, args.t, args.out))
+    else:
+        print(wt.policies.export_sb3(run, args.t, args.out))
+
+
+@app.command(name="import")
+def _import(
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="HDF5 file of an export")],
+    out: Annotated[Path, tyro.conf.arg(help="folder of the data set to be written")],
+) -> None:
+    """Make a data set of an HDF5 file that `export` wrote; every digest is checked."""
+    print(wt.open(wt.import_hdf5(file, out)))
+
+
+def _state_of(path: Path) -> str:
+    """What remains to be said of something whole: it may not be finished."""
+    if not (path / "dataset.json").is_file():
+        return ""
+    dataset = wt.open(path)
+    if dataset.info.status == "complete":
+        return ""
+    done = sum(run.info.status == "complete" for run in dataset)
+    return f" so far; {done} of {len(dataset.info.runs)} runs are complete"
+
+
+def _finish(path: Path, problems: list[str], otherwise: str) -> None:
     for problem in problems:
         print(problem)
-    print(f"{path}: {len(problems)} problems" if problems else f"{path}: whole")
+    print(f"{path}: {f'{len(problems)} problems' if problems else otherwise}")
     if problems:
         raise SystemExit(1)
 
@@ -76,7 +184,7 @@ def main() -> None:
     """Run the command line; errors of ours are printed without a traceback."""
     try:
         app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
-    except (WeightTrajError, FileNotFoundError) as error:
+    except (WeightTrajError, OSError) as error:
         console.print(f"[red]error:[/red] {escape(str(error))}", style=None)
         sys.exit(1)
     except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough

@@ -80,6 +80,14 @@ class WindowError(WeightTrajError, ValueError):
     """Windows that the stored runs cannot give."""
 
 
+class CacheError(WeightTrajError, OSError):
+    """The cache of decoded weights cannot be used: no space, or no right to write."""
+
+
+class LoaderError(WeightTrajError, ValueError):
+    """A loader's saved state does not fit the loader it is given to."""
+
+
 class MissingExtraError(WeightTrajError, ImportError):
     """An optional dependency is not installed."""
 

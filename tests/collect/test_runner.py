@@ -21,6 +21,8 @@ from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe
 from weighttraj.collect.recipe import Seeds, parse_seeds
 from weighttraj.errors import CollectError, RecipeError
+from weighttraj.format import RunEntry
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
 TOML = """
 id = "small"
@@ -111,11 +113,11 @@ def test_processes_give_the_same_bytes(small_dataset: Path, tmp_path: Path) -> N
 def test_collecting_again_does_nothing(tmp_path: Path) -> None:
     out = tmp_path / "dataset"
     collect(one_seed(), out)
-    before = {p: p.stat().st_mtime_ns for p in out.rglob("c/*")}
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
     screen = io.StringIO()
     collect(one_seed(), out, console=Console(file=screen))
     assert "seed 0: complete, 49 snapshots" in screen.getvalue()
-    assert before == {p: p.stat().st_mtime_ns for p in out.rglob("c/*")}
+    assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
 
 
 def test_seeds_can_be_added(tmp_path: Path) -> None:
@@ -154,7 +156,8 @@ def test_a_killed_collector_goes_on_where_it_was(
     said = " ".join(again.stdout.split())
     assert f"interrupted after {len(run)} committed snapshots" in said
     assert "continuing after the last" in said
-    run = wt.open_run(path)
+    assert not path.exists()
+    run = wt.open_run(path)  # packed meanwhile
     assert run.info.status == "complete"
     for name in whole.arrays:
         assert np.array_equal(run[name][:], whole[name][:], equal_nan=True), name
@@ -204,9 +207,9 @@ def test_a_run_that_does_not_repeat_itself_starts_over(small_dataset: Path, tmp_
                 ret_norm=(np.array(0.0), np.array(1.0), 1.0),
             )
         raise ZeroDivisionError
-    entry = {"id": "seed0000", "path": "runs/seed0000.zarr", "seed": 0, "split": "train"}
-    recipe = json.loads((small_dataset / "dataset.json").read_text())
-    (out / "dataset.json").write_text(json.dumps(recipe | {"runs": [entry]}))
+    entry = RunEntry(id="seed0000", path="runs/seed0000.zarr", seed=0, split="train")
+    info = read_dataset_info(small_dataset)
+    write_dataset_info(out, replace(info, runs=(entry,), status="collecting"))
     screen = io.StringIO()
     dataset = collect(one_seed(), out, console=Console(file=screen, width=1000))
     assert "does not repeat its committed snapshots" in screen.getvalue()

@@ -6,7 +6,7 @@ import pytest
 
 from weighttraj.errors import FormatError, NewerFormatError
 from weighttraj.format import DatasetInfo, EnvInfo, ParamLayout, RunEntry, RunInfo
-from weighttraj.format.schema import FORMAT_VERSION, parse_json, to_json
+from weighttraj.format.schema import FORMAT_VERSION, load_json, parse, to_json
 
 LAYOUT = ParamLayout.of({"w": ((2, 3), "weight", ("hidden_0", "observation"))})
 INFO = RunInfo(run_id="run", layout=LAYOUT, env=EnvInfo(id="CartPole-v1", kwargs={"a": [1.5]}))
@@ -16,13 +16,17 @@ def changed(**values: object) -> bytes:
     return json.dumps(to_json(INFO) | values).encode()
 
 
+def read(text: bytes) -> RunInfo:
+    return parse(load_json(text, "here"), RunInfo, "here")
+
+
 def test_metadata_survives_json() -> None:
-    assert parse_json(changed(), RunInfo, "here") == INFO
+    assert read(changed()) == INFO
 
 
 def test_a_newer_format_is_refused_with_the_way_out() -> None:
     with pytest.raises(NewerFormatError, match="pip install --upgrade weighttraj"):
-        parse_json(changed(format_version=FORMAT_VERSION + 1), RunInfo, "here")
+        read(changed(format_version=FORMAT_VERSION + 1))
 
 
 @pytest.mark.parametrize(
@@ -44,13 +48,13 @@ def test_a_newer_format_is_refused_with_the_way_out() -> None:
 )
 def test_bad_metadata_is_one_clear_error(text: bytes) -> None:
     with pytest.raises(FormatError):
-        parse_json(text, RunInfo, "here")
+        read(text)
 
 
 def test_a_layout_of_terabytes_is_refused_before_anything_is_allocated() -> None:
     huge = {"name": "w", "shape": [2**40], "offset": 0, "role": "weight", "axes": ["a"]}
     with pytest.raises(FormatError, match=r"2\*\*31"):
-        parse_json(changed(layout={"params": [huge]}), RunInfo, "here")
+        read(changed(layout={"params": [huge]}))
 
 
 @pytest.mark.parametrize("path", ["../run.zarr", "/etc", "runs/other.zarr", "runs/../run.zarr"])

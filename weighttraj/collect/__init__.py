@@ -10,6 +10,7 @@ except ModuleNotFoundError as error:
 from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.ppo import PPOConfig, make_ppo
 from weighttraj.collect.recipe import Recipe, read_recipe
+from weighttraj.collect.replay import replay
 from weighttraj.collect.runner import collect
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "collect",
     "make_ppo",
     "read_recipe",
+    "replay",
 ]
 
 del _sb3

@@ -13,6 +13,7 @@ import msgspec
 
 from weighttraj.collect.ppo import PPOConfig
 from weighttraj.errors import RecipeError
+from weighttraj.format.schema import Profile
 
 SPLITS = ("train", "validation", "test")
 
@@ -47,6 +48,8 @@ class Store:
     """Network inputs kept of each rollout."""
     block: int = 64
     """Snapshots in a chunk and in a commit."""
+    profile: Profile = "default"
+    """How a finished run is packed: ``default``, or ``archive``, the smallest."""
 
 
 @dataclass(frozen=True, kw_only=True)

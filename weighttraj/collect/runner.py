@@ -6,6 +6,7 @@ import contextlib
 import json
 import multiprocessing
 import queue
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -26,9 +27,10 @@ from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.recipe import Recipe
 from weighttraj.errors import CollectError, ReplayError, WeightTrajError
 from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_dataset
-from weighttraj.format.reader import read_dataset_info
-from weighttraj.format.schema import to_json
-from weighttraj.format.storage import read_info, replace_file
+from weighttraj.format.catalog import MANIFEST, read_dataset_info, write_dataset_info
+from weighttraj.format.integrity import seal
+from weighttraj.format.packing import pack
+from weighttraj.format.storage import PACKED, read_info
 
 Report = Callable[[int, int], None]
 """Called with a seed and its environment steps so far."""
@@ -91,7 +93,7 @@ def collect(
             do="mend the cause and give the same command again: it goes on where it stopped",
         )
     with _lock(out):
-        _write_info(out, _with_status(out, read_dataset_info(out)))
+        _settle(out)
     return open_dataset(out)
 
 
@@ -112,10 +114,16 @@ def collect_run(task: Task, report: Report) -> None:
     try:
         model = make_ppo(config, seed=task.seed)
         progress = _ProgressCallback(task.seed, report)
-        model.learn(config.n_iterations * config.n_steps, callback=[callback, progress])
+        if not _is_complete(task.path):
+            model.learn(config.n_iterations * config.n_steps, callback=[callback, progress])
     finally:
         callback.close()
         torch.set_num_threads(threads)
+    pack(task.path, profile=store.profile)
+
+
+def _is_complete(path: Path) -> bool:
+    return path.exists() and read_info(path).status == "complete"
 
 
 class _ProgressCallback(BaseCallback):
@@ -133,6 +141,7 @@ class _ProgressCallback(BaseCallback):
 def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     """Write ``dataset.json`` with every run that will be there."""
     document = json.loads(json.dumps(asdict(recipe))) | {"seeds": recipe.seeds.by_split()}
+    old = None
     info = DatasetInfo(
         id=recipe.id, version=recipe.version, licence=recipe.licence, recipe=document
     )
@@ -165,9 +174,25 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
             known[seed] = RunEntry(id=name, path=f"runs/{name}.zarr", seed=seed)
         split = cast(Literal["train", "validation", "test", ""], splits.get(seed, ""))
         known[seed] = replace(known[seed], split=split)
-    info = replace(info, status="collecting", runs=tuple(known.values()))
-    _write_info(out, info)
+    runs = tuple(_settled(out, run) for run in known.values())
+    info = replace(info, runs=runs)
+    if info != old:
+        (out / MANIFEST).unlink(missing_ok=True)
+        info = replace(info, status="collecting")
+        write_dataset_info(out, info)
     return info
+
+
+def _settled(out: Path, entry: RunEntry) -> RunEntry:
+    """The entry of a run, packed if it is finished; its folder goes once the file is listed."""
+    folder = entry.path.removesuffix(PACKED)
+    packed = f"{folder}{PACKED}"
+    if not (out / packed).is_file():
+        return entry
+    if entry.path == packed and (out / folder).is_dir():
+        shutil.rmtree(out / folder)
+        (out / f"{folder}.lock").unlink(missing_ok=True)
+    return replace(entry, path=packed)
 
 
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -295,7 +320,7 @@ def _plan(
             unreadable.append((task, error))
             continue
         console.print(f"seed {task.seed}: {_progress_of(info)}")
-        if info is None or info.status != "complete":
+        if not entry.path.endswith(PACKED):
             tasks.append(task)
     return tasks, unreadable
 
@@ -320,11 +345,11 @@ def _start_over(out: Path, task: Task, error: ReplayError, console: Console) -> 
     info = read_dataset_info(out)
     old = next(run for run in info.runs if run.seed == task.seed)
     n = 2
-    while (out / f"runs/seed{task.seed:04d}-{n}.zarr").exists():
+    while list(out.glob(f"runs/seed{task.seed:04d}-{n}.zarr*")):
         n += 1
     name = f"seed{task.seed:04d}-{n}"
     new = replace(old, id=name, path=f"runs/{name}.zarr")
-    _write_info(out, replace(info, runs=tuple(new if r is old else r for r in info.runs)))
+    write_dataset_info(out, replace(info, runs=tuple(new if r is old else r for r in info.runs)))
     console.print(
         f"seed {task.seed}: {error}\n"
         f"seed {task.seed}: starting over as {name}; what it had committed stays in {old.path}"
@@ -337,11 +362,15 @@ def _lock(out: Path) -> FileLock:
     return FileLock(out.with_name(f".{out.name}.lock"))
 
 
-def _with_status(out: Path, info: DatasetInfo) -> DatasetInfo:
-    paths = [out / run.path for run in info.runs]
-    done = all(path.exists() and read_info(path).status == "complete" for path in paths)
-    return replace(info, status="complete" if done else "collecting")
-
-
-def _write_info(out: Path, info: DatasetInfo) -> None:
-    replace_file(out / "dataset.json", json.dumps(to_json(info), indent=1).encode())
+def _settle(out: Path) -> None:
+    """List the packed runs, drop their folders, and seal the data set if it has all its runs."""
+    info = read_dataset_info(out)
+    info = replace(info, runs=tuple(_settled(out, run) for run in info.runs))
+    done = all(run.path.endswith(PACKED) for run in info.runs)
+    now = replace(info, status="complete" if done else "collecting")
+    if now != read_dataset_info(out):
+        write_dataset_info(out, now)
+    for run in info.runs:
+        _settled(out, run)
+    if done and not (out / MANIFEST).is_file():
+        seal(out)

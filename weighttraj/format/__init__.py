@@ -1,7 +1,10 @@
 """What lies on disk. ``FORMAT.md`` beside this file is the specification."""
 
-from weighttraj.format.integrity import verify
+from weighttraj.format.export import export_npy, export_safetensors
+from weighttraj.format.integrity import repair, seal, verify
 from weighttraj.format.layout import ParamLayout, ParamSpec
+from weighttraj.format.lint import lint
+from weighttraj.format.packing import pack
 from weighttraj.format.reader import Dataset, Run, open_dataset, open_run
 from weighttraj.format.schema import (
     FORMAT_VERSION,
@@ -33,7 +36,13 @@ __all__ = [
     "RunEntry",
     "RunInfo",
     "RunWriter",
+    "export_npy",
+    "export_safetensors",
+    "lint",
     "open_dataset",
     "open_run",
+    "pack",
+    "repair",
+    "seal",
     "verify",
 ]

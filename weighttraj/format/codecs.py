@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec, ShardingCodecIndexLocation
+from zarr.codecs import BloscCodec, Crc32cCodec, ShardingCodecIndexLocation, TransposeCodec
 from zarr.codecs.numcodecs import PCodec
 from zarr.core.array import ShardsConfigParam
 from zarr.errors import ZarrUserWarning
@@ -20,6 +20,10 @@ from weighttraj.format.schema import ArraySpec, Profile
 
 MAX_CHUNK_PARAMS = 16_384
 """Columns in a chunk. While a run is collected, wider arrays are sharded: one file a block."""
+
+MAX_NARROW = 1024
+"""Parameters up to which a packed chunk is transposed: a tenth smaller, where reading it is fast
+anyway. Larger policies would decode at half the speed."""
 
 PACKED_CHUNK_BYTES = 4 << 20
 """Decoded bytes in a chunk of a packed run, about."""
@@ -73,7 +77,7 @@ def create_array(
             shards=shards,
             fill_value=spec.fill,
             dimension_names=dims,
-            **_codecs(spec, profile, by_column),
+            **_codecs(spec, profile, packed=packed_rows is not None),
         )
 
 
@@ -106,9 +110,10 @@ def check_array(spec: ArraySpec, document: Any, rows: int, where: str) -> None:
             and not document.get("storage_transformers")
         )
         size = math.prod(inner) * np.dtype(spec.dtype).itemsize
-        small = len(inner) == len(shape) and min(inner) > 0 and size <= MAX_CHUNK_BYTES
+        small = size <= MAX_CHUNK_BYTES and min(spec.inner, default=1) > 0
+        small = small and _divides(inner, [0] * len(shape)) and _shards_fit(document, inner)
         unknown = sorted(set(_codec_names(document["codecs"])) - KNOWN_CODECS)
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         if isinstance(error, FormatError):
             raise
         raise DamageError(
@@ -146,17 +151,42 @@ def _packed_chunk(spec: ArraySpec, rows: int, by_column: bool) -> tuple[int, tup
     return max(1, min(rows, fitting)), columns
 
 
-def _codecs(spec: ArraySpec, profile: Profile, by_column: bool) -> dict[str, Any]:
+def _codecs(spec: ArraySpec, profile: Profile, *, packed: bool) -> dict[str, Any]:
     # Crc32c last: without it no bit flip in a compressed chunk is noticed.
     if profile == "archive" and spec.dtype != "uint8":
-        delta = {"delta_spec": "try_consecutive", "delta_encoding_order": 1} if by_column else {}
         return {
-            "serializer": PCodec(level=8, mode_spec="classic", **delta),
+            "serializer": PCodec(level=8, mode_spec="classic"),
             "compressors": (Crc32cCodec(),),
         }
     itemsize = np.dtype(spec.dtype).itemsize
-    blosc = BloscCodec(cname="zstd", clevel=5, shuffle="shuffle", typesize=itemsize)
-    return {"compressors": (blosc, Crc32cCodec())}
+    # Both decode at memory speed; the slow encoder, once for a packed run, makes a twentieth less.
+    blosc = BloscCodec(
+        cname="lz4hc" if packed else "lz4",
+        clevel=5 if packed else 9,
+        shuffle="shuffle",
+        typesize=itemsize,
+    )
+    codecs: dict[str, Any] = {"compressors": (blosc, Crc32cCodec())}
+    if packed and spec.dims[1:] in (("param",), ("critic_param",)) and spec.inner[0] <= MAX_NARROW:
+        codecs["filters"] = (TransposeCodec(order=(1, 0)),)
+    return codecs
+
+
+def _divides(chunk: list[int], outer: list[int]) -> bool:
+    """Whether a chunk's shape is made of positive integers that divide those of another shape."""
+    pairs = zip(chunk, outer, strict=True)
+    return all(type(c) is int and c > 0 and o % c == 0 for c, o in pairs)
+
+
+def _shards_fit(document: dict[str, Any], outer: list[int]) -> bool:
+    """Whether shards, if there are any, are cut into whole chunks, and lie in no other shard."""
+    codecs = document["codecs"]
+    if "sharding_indexed" not in _codec_names(codecs):
+        return True
+    shard = codecs[0]["configuration"]
+    inner = [*_codec_names(shard["codecs"]), *_codec_names(shard["index_codecs"])]
+    plain = len(codecs) == 1 and "sharding_indexed" not in inner
+    return plain and _divides(shard["chunk_shape"], outer)
 
 
 def _codec_names(codecs: list[dict[str, Any]]) -> Iterator[str]:

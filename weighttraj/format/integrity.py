@@ -1,22 +1,47 @@
-"""Is a run or data set whole? Reads every byte and says what is wrong."""
+"""Is a run or data set whole? Says what is wrong, and mends what can be mended."""
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from weighttraj.errors import WeightTrajError
+from weighttraj.errors import DamageError, FormatError, WeightTrajError
+from weighttraj.format.catalog import (
+    MANIFEST,
+    check_manifest,
+    read_dataset_info,
+    write_dataset_info,
+    write_manifest,
+)
+from weighttraj.format.live import LiveStore
+from weighttraj.format.objects import ZipObjects
+from weighttraj.format.packing import same_as_packed
 from weighttraj.format.reader import Dataset, Run, StoredArray, open_dataset, open_run
+from weighttraj.format.schema import AXES, Axis, load_json
+from weighttraj.format.storage import PACKED, RunStore, member_documents
+from weighttraj.format.tables import write_tables
+from weighttraj.format.writer import lock_run
 
 MONOTONE = ("index/iteration", "index/gradient_step", "index/num_timesteps")
 
+_DRAFT = re.compile(r"\..+\.\d+\.draft")
 
-def verify(path: str | Path) -> list[str]:
-    """Problems of the data set or run at a path; an empty list means that it is whole.
 
-    Every committed chunk is decoded, its crc32c checked, each snapshot compared with its digest;
-    counters must not go back and weights must be finite.
+def verify(path: str | Path, *, deep: bool = False) -> list[str]:
+    """Problems of the data set, run or HDF5 file at a path; an empty list means that it is whole.
+
+    Every byte is read. Of a complete data set, each object is compared with its hash in the
+    manifest and each snapshot with its digest. Of anything else, or with ``deep``, every chunk is
+    decoded too, counters must not go back and weights must be finite.
 
     Raises:
         FileNotFoundError: there is neither a data set nor a run at the path.
@@ -24,38 +49,269 @@ def verify(path: str | Path) -> list[str]:
     path = Path(path)
     try:
         if (path / "dataset.json").is_file():
-            return verify_dataset(open_dataset(path))
-        return verify_run(open_run(path))
+            return _verify_dataset(open_dataset(path), deep)
+        if path.suffix == ".h5":
+            return [p for run in open_dataset(path) for p in _verify_arrays(run, deep=True)]
+        return list(_verify_run(open_run(path), deep=True))
     except WeightTrajError as error:
         return [str(error)]
 
 
-def verify_dataset(dataset: Dataset) -> list[str]:
-    """Problems of all runs."""
-    return [problem for run in dataset for problem in verify_run(run)]
+def seal(path: str | Path) -> Dataset:
+    """Write the tables and, last, the manifest of a complete data set.
+
+    Raises:
+        FormatError: some of its runs are not complete.
+    """
+    dataset = open_dataset(path)
+    open_runs = [run.id for run in dataset if run.info.status != "complete"]
+    if open_runs or len(dataset) < len(dataset.info.runs):
+        raise FormatError(
+            "only a complete data set can be sealed",
+            expected=f"{len(dataset.info.runs)} complete runs",
+            got=f"{len(dataset)} runs, not complete: {open_runs}",
+            where=path,
+            do="give the command that collects it again: it goes on where it stopped",
+        )
+    write_tables(dataset)
+    write_manifest(dataset.path)
+    return dataset
 
 
-def verify_run(run: Run) -> list[str]:
-    """Problems of one run."""
-    problems = []
-    for name, array in run.arrays.items():
+def repair(path: str | Path, *, cut: bool = False) -> list[str]:
+    """Mend what can be mended without the training; say what was done and what is left to do.
+
+    Metadata of arrays are written again from the run's checked metadata, rows that were never
+    committed and drafts of killed writers are removed, and the tables and manifest of a data set
+    whose runs are whole are written anew.
+
+    Args:
+        path: data set or run.
+        cut: drop damaged snapshots, and those after them. The run is then ``crashed``, and
+            collecting its recipe again makes what was dropped, in the same bytes.
+
+    Raises:
+        FileNotFoundError: there is neither a data set nor a run at the path.
+        FormatError: its own metadata is damaged; only a copy helps.
+        StoreLockedError: a run is being written.
+    """
+    path = Path(path)
+    if not (path / "dataset.json").is_file():
+        return _repair_run(path, cut)
+    info = read_dataset_info(path)
+    done = [step for run in info.runs for step in _repair_entry(path, run.path, cut)]
+    if info.status == "complete":
+        info = read_dataset_info(path)
+        damaged = [run.path for run in info.runs if _problems_of(path / run.path)]
+        if damaged or info.status != "complete":
+            return [*done, "the manifest is not written again: the data set is not whole"]
+        if check_manifest_quietly(path):
+            seal(path)
+            done.append(f"{path}: tables and manifest written anew")
+    return done
+
+
+def check_manifest_quietly(path: Path) -> list[str]:
+    """Problems of the manifest, also when it cannot be read."""
+    try:
+        return check_manifest(path)
+    except WeightTrajError as error:
+        return [str(error)]
+
+
+def _verify_dataset(dataset: Dataset, deep: bool) -> list[str]:
+    complete = dataset.info.status == "complete"
+    problems = check_manifest_quietly(dataset.path) if complete else []
+    for run in dataset:
         try:
-            problems += _verify_array(name, array, where=str(run.path))
+            problems += _verify_run(run, deep=deep or not complete)
         except WeightTrajError as error:
             problems.append(str(error))
     return problems
 
 
-def _verify_array(name: str, array: StoredArray, *, where: str) -> list[str]:
-    problems = []
+def _problems_of(path: Path) -> list[str]:
+    try:
+        return list(_verify_run(open_run(path), deep=True))
+    except (WeightTrajError, FileNotFoundError) as error:
+        return [str(error)]
+
+
+def _verify_run(run: Run, *, deep: bool) -> Iterator[str]:
+    yield from _verify_objects(RunStore.open(run.path))
+    yield from _verify_arrays(run, deep=deep)
+
+
+def _verify_arrays(run: Run, *, deep: bool) -> Iterator[str]:
+    for name, array in run.arrays.items():
+        if not deep and name != "policy/weights":
+            continue
+        try:
+            yield from _verify_array(name, array, where=str(run.path))
+        except WeightTrajError as error:
+            yield str(error)
+
+
+def _verify_objects(store: RunStore) -> Iterator[str]:
+    """Objects that are missing or strange, and metadata that are not as they were written."""
+    text = store.objects.read("zarr.json") or b""
+    if json.dumps(json.loads(text), indent=1).encode() != text:
+        yield f"{store.path}, zarr.json: not in the form in which it was written"
+    documents = member_documents(store.documents)
+    for name, content in documents.items():
+        got = store.objects.read(name) or b""
+        if got != content and not _is_earlier(store, name, got):
+            yield (
+                f"{store.path}, {name}: not what the run's metadata says; a writer was "
+                "interrupted, or the file is damaged (weighttraj repair writes it again)"
+            )
+    present = set(_names(store))
+    expected = {"zarr.json", *documents}
+    for name in store.documents:
+        if (count := _chunk_count(store, name)) > len(present):
+            yield f"{store.path}, {name}: {count} chunks expected, only {len(present)} objects"
+            return
+        expected |= set(_chunk_keys(store, name))
+    yield from (f"{store.path}, {name}: missing" for name in sorted(expected - present))
+    for name in sorted(present - expected) if store.info.status == "complete" else ():
+        yield f"{store.path}, {name}: not part of what was committed (weighttraj repair removes it)"
+    if isinstance(store.objects, ZipObjects) and not same_as_packed(store.path):
+        yield f"{store.path}: bytes of the zip file's own directory are damaged"
+
+
+def _is_earlier(store: RunStore, name: str, content: bytes) -> bool:
+    """Whether metadata are those of an earlier commit: a run is being written at this moment."""
+    array = name.removesuffix("/zarr.json")
+    if store.info.status != "collecting" or array not in store.specs:
+        return False
+    try:
+        document = load_json(content, name)
+        rows, shape = document["shape"][0], store.documents[array]["shape"]
+        document["shape"] = shape
+        return bool(0 <= rows <= shape[0]) and document == store.documents[array]
+    except (ValueError, TypeError, KeyError, IndexError):
+        return False
+
+
+def _verify_array(name: str, array: StoredArray, *, where: str) -> Iterator[str]:
     last = None
-    for start in range(0, len(array), 64):
-        rows = array[start : start + 64]
+    for start in range(0, len(array), 512):
+        rows = array[start : start + 512]
         if name == "policy/weights" and not np.isfinite(rows).all():
-            problems.append(f"{where}, {name}: not finite between rows {start} and {start + 64}")
+            yield f"{where}, {name}: not finite between rows {start} and {start + 512}"
         if name in MONOTONE:
             steps = np.diff(rows, prepend=rows[:1] if last is None else last)
             if (steps < 0).any():
-                problems.append(f"{where}, {name}: goes back at row {start + np.argmax(steps < 0)}")
+                yield f"{where}, {name}: goes back at row {start + int(np.argmax(steps < 0))}"
             last = rows[-1:]
-    return problems
+
+
+def _grid(store: RunStore, name: str) -> list[int]:
+    """Chunks of an array's committed rows, along each axis."""
+    document: Any = store.documents[name]
+    sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return [-(-n // c) for n, c in zip(document["shape"], sizes, strict=True)]
+
+
+def _chunk_count(store: RunStore, name: str) -> int:
+    return math.prod(_grid(store, name))
+
+
+def _chunk_keys(store: RunStore, name: str) -> Iterator[str]:
+    """Names of all chunks of an array's committed rows."""
+    for index in itertools.product(*map(range, _grid(store, name))):
+        yield "/".join([name, "c", *map(str, index)])
+
+
+def _names(store: RunStore) -> Iterator[str]:
+    if isinstance(store.objects, ZipObjects):
+        yield from store.objects.names
+        return
+    for file in store.path.rglob("*"):
+        if file.is_symlink() or not file.is_dir():
+            yield file.relative_to(store.path).as_posix()
+
+
+def _repair_entry(dataset: Path, entry: str, cut: bool) -> list[str]:
+    """Repair one run of a data set; a packed one that is damaged can only be made again."""
+    path = dataset / entry
+    if not path.exists():
+        return (
+            [f"{path}: missing; collect the recipe again"] if not cut else _forget(dataset, entry)
+        )
+    if not entry.endswith(PACKED):
+        return _repair_run(path, cut)
+    problems = _problems_of(path)
+    if not problems:
+        return []
+    if not cut:
+        return [*problems, f"{path}: damaged; --cut drops it, so that it is collected again"]
+    path.rename(path.with_name(f".{path.name}.damaged"))
+    return _forget(dataset, entry)
+
+
+def _forget(dataset: Path, entry: str) -> list[str]:
+    """Note that a run of a data set is to be collected again."""
+    info = read_dataset_info(dataset)
+    new = entry.removesuffix(PACKED)
+    runs = tuple(replace(r, path=new) if r.path == entry else r for r in info.runs)
+    (dataset / MANIFEST).unlink(missing_ok=True)
+    write_dataset_info(dataset, replace(info, runs=runs, status="collecting"))
+    return [f"{dataset / entry}: dropped; collect the recipe again"]
+
+
+def _repair_run(path: Path, cut: bool) -> list[str]:
+    if path.is_file():
+        return _problems_of(path)
+    with lock_run(path):
+        before = {p for p in _problems_of(path) if "weighttraj repair" in p}
+        store = LiveStore.open(path)
+        _sweep(store)
+        done = [f"mended: {problem}" for problem in sorted(before)]
+        rows = {axis: _whole_rows(store, axis) for axis in AXES}
+        if all(rows[axis] == store.info.committed(axis) for axis in AXES):
+            return done
+        if not cut:
+            return [
+                *done,
+                f"{path}: damaged after row {rows['time']} of {store.info.n_committed}; --cut "
+                "drops what follows, so that it is collected again",
+            ]
+        store.commit(
+            replace(
+                store.info,
+                status="crashed",
+                n_committed=rows["time"],
+                n_committed_iterations=rows["iteration"],
+            )
+        )
+        _sweep(store)
+    return [*done, f"{path}: cut to {rows['time']} snapshots; collect the recipe again"]
+
+
+def _sweep(store: LiveStore) -> None:
+    """Remove files that belong to nothing that was committed."""
+    documents = member_documents(store.documents)
+    chunks = {key for name in store.documents for key in _chunk_keys(store, name)}
+    for name in _names(store):
+        if name not in chunks and name not in documents and name != "zarr.json":
+            (store.path / name).unlink()
+    for draft in store.path.parent.glob(f".{store.path.name}.*"):
+        if _DRAFT.fullmatch(draft.name):
+            shutil.rmtree(draft)
+
+
+def _whole_rows(store: RunStore, axis: Axis) -> int:
+    """Rows before the first damaged one, in whole blocks."""
+    n, block = store.info.committed(axis), store.info.block
+    arrays = {s.name: StoredArray(store, s) for s in store.specs.values() if s.axis == axis}
+    for start in range(0, n, block):
+        try:
+            for array in arrays.values():
+                array[start : start + block]
+        except DamageError:
+            return start
+    return n
+
+
+__all__ = ["repair", "seal", "verify"]

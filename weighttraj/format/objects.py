@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +17,9 @@ from weighttraj.errors import DamageError, FormatError
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
+
+MAX_NAME = 200
+"""Characters between two slashes of a name: file systems take 255, drafts have longer ones."""
 
 
 @runtime_checkable
@@ -45,23 +49,28 @@ class FolderObjects:
     def read(self, name: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """See ``Objects``."""
         try:
-            handle = os.open(self._checked(name), os.O_RDONLY)
+            # A pipe in the place of a file would be waited for.
+            handle = os.open(self.file(name), os.O_RDONLY | os.O_NONBLOCK)
         except (FileNotFoundError, NotADirectoryError):
             return None
         try:
-            return _read_range(handle, 0, os.fstat(handle).st_size, start, stop)
+            status = os.fstat(handle)
+            if not stat.S_ISREG(status.st_mode):
+                return None
+            return _read_range(handle, 0, status.st_size, start, stop)
         finally:
             os.close(handle)
 
     def exists(self, name: str) -> bool:
         """See ``Objects``."""
-        return os.path.isfile(self._checked(name))
+        return os.path.isfile(self.file(name))
 
-    def _checked(self, name: str) -> str:
+    def file(self, name: str) -> str:
+        """Path of an object, which is no link."""
         path = f"{self._root}/{check_name(name, self.path)}"
         if os.path.realpath(path) != path:
             raise FormatError(
-                "a file of the run is a link",
+                "a file of the data is a link",
                 expected="plain files: a link could lead anywhere",
                 got=f"{path} -> {os.path.realpath(path)}",
                 where=self.path,
@@ -76,6 +85,7 @@ class ZipObjects:
 
     Raises:
         DamageError: the file is no whole zip file.
+        DamageError: a member reaches into another, or out of the file.
         FormatError: a member is compressed, encrypted, there twice or named like a path out.
     """
 
@@ -83,7 +93,7 @@ class ZipObjects:
         self.path = path
         try:
             with zipfile.ZipFile(path) as archive:
-                members = archive.infolist()
+                members, end = archive.infolist(), archive.start_dir
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
             if isinstance(error, FileNotFoundError):
                 raise
@@ -94,7 +104,17 @@ class ZipObjects:
                 do="restore the file from a copy, or collect the run again",
             ) from error
         self._members: dict[str, tuple[int, int]] = {}
+        self._ends: dict[str, int] = {}
+        end = path.stat().st_size
         for member in members:
+            if not 0 <= member.header_offset <= end - 30 - member.file_size:
+                raise DamageError(
+                    "a member of the packed run lies outside the file",
+                    expected=f"a place within {end} bytes",
+                    got=f"{member.file_size} bytes at {member.header_offset}",
+                    where=f"{path}, {member.filename!r}",
+                    do="restore the file from a copy, or collect the run again",
+                )
             name = check_name(member.filename, path)
             odd = member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 0x1
             if odd or name in self._members or member.file_size != member.compress_size:
@@ -106,6 +126,12 @@ class ZipObjects:
                     do="do not use data from a source that you do not trust",
                 )
             self._members[name] = (member.header_offset, member.file_size)
+        # From the last to the first: members that share bytes would be a bomb.
+        for name, (offset, size) in sorted(self._members.items(), key=lambda m: m[1], reverse=True):
+            self._ends[name] = end
+            if not 0 <= offset <= offset + 30 + size <= end:
+                raise self._misplaced(name, offset)
+            end = offset
 
     @property
     def names(self) -> list[str]:
@@ -120,16 +146,11 @@ class ZipObjects:
         handle = os.open(self.path, os.O_RDONLY)
         try:
             header = os.pread(handle, 30, offset)
-            if header[:4] != _LOCAL_HEADER or len(header) < 30:
-                raise DamageError(
-                    "a member of the packed run is not where the directory says",
-                    expected=f"a local header at byte {offset}",
-                    got=header[:4],
-                    where=f"{self.path}, {name}",
-                    do="restore the file from a copy, or collect the run again",
-                )
             skip = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
-            return _read_range(handle, offset + 30 + skip, size, start, stop)
+            first = offset + 30 + skip
+            if header[:4] != _LOCAL_HEADER or first + size > self._ends[name]:
+                raise self._misplaced(name, offset)
+            return _read_range(handle, first, size, start, stop)
         finally:
             os.close(handle)
 
@@ -137,14 +158,23 @@ class ZipObjects:
         """See ``Objects``."""
         return name in self._members
 
+    def _misplaced(self, name: str, offset: int) -> DamageError:
+        return DamageError(
+            "a member of the packed run is not where the directory says",
+            expected=f"a local header at byte {offset}, and bytes of its own after it",
+            where=f"{self.path}, {name}",
+            do="restore the file from a copy, or collect the run again",
+        )
+
 
 def check_name(name: str, where: object) -> str:
     """Return the name of an object; it cannot lead out of its folder.
 
     Raises:
-        FormatError: it is empty, absolute, has ``..`` or unusual characters.
+        FormatError: it is empty, absolute, too long, has ``..`` or unusual characters.
     """
-    if _NAME.fullmatch(name) is None or ".." in name:
+    parts = name.split("/")
+    if _NAME.fullmatch(name) is None or ".." in name or max(map(len, parts)) > MAX_NAME:
         raise FormatError(
             "refused: the name of an object could lead out of its folder",
             expected="letters, digits, '.', '_', '-', and '/' between them",
@@ -164,6 +194,28 @@ def write_zip(path: Path, members: Iterable[tuple[str, Path]]) -> None:
             with source.open("rb") as reader, archive.open(info, "w") as writer:
                 while piece := reader.read(1 << 22):
                     writer.write(piece)
+
+
+def replace_file(path: Path, content: bytes, *, durable: bool = True) -> None:
+    """Write a file so that readers see the old content or the new; durable: after a power cut."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
+    with draft.open("wb") as file:
+        file.write(content)
+        file.flush()
+        if durable:
+            os.fsync(file.fileno())
+    draft.replace(path)
+    if durable:
+        sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """See a file or folder on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _read_range(handle: int, offset: int, size: int, start: int, stop: int | None) -> bytes:

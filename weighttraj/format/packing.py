@@ -10,9 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from weighttraj.errors import FormatError
-from weighttraj.format.objects import ZipObjects, write_zip
+from weighttraj.format.live import LiveStore
+from weighttraj.format.objects import ZipObjects, sync, write_zip
 from weighttraj.format.schema import AXES, Profile
-from weighttraj.format.storage import PACKED, LiveStore, RunStore, sync
+from weighttraj.format.storage import PACKED, RunStore
 
 
 def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | None = None) -> Path:
@@ -42,6 +43,13 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
             where=path,
             do="finish collecting it first",
         )
+    if unknown := sorted(source.documents.keys() - source.specs.keys()):
+        raise FormatError(
+            "the run has arrays that this version of weighttraj does not know",
+            got=unknown,
+            where=path,
+            do="pip install --upgrade weighttraj, so that nothing is lost",
+        )
     target = Path(out or str(path).removesuffix(PACKED) + PACKED)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
         live = LiveStore.create(
@@ -54,7 +62,6 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
             for start in range(0, rows, step):
                 live.write(name, start, source.read(name, slice(start, min(start + step, rows))))
         live.commit(replace(source.info, profile=profile))
-        live.trim()
         draft = Path(folder) / "run.zip"
         write_zip(draft, _members(live.path))
         sync(draft)
@@ -92,9 +99,9 @@ def unpacked(path: Path) -> Iterator[Path]:
 
 def _members(folder: Path) -> Iterator[tuple[str, Path]]:
     """Files of a run in a fixed order, its metadata first."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    for file in sorted(files, key=lambda file: file.name != "zarr.json"):
-        yield file.relative_to(folder).as_posix(), file
+    files = {f.relative_to(folder).as_posix(): f for f in folder.rglob("*") if f.is_file()}
+    for name in sorted(files, key=lambda n: (n != "zarr.json", not n.endswith("zarr.json"), n)):
+        yield name, files[name]
 
 
 def _equal(one: Path, other: Path) -> bool:

@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from weighttraj.errors import DamageError, FormatError
+from weighttraj.format.catalog import read_dataset_info
 from weighttraj.format.layout import ParamLayout
-from weighttraj.format.schema import ArraySpec, DatasetInfo, RunEntry, RunInfo, parse_json
+from weighttraj.format.schema import ArraySpec, DatasetInfo, RunEntry, RunInfo
 from weighttraj.format.storage import RunStore
 
 if TYPE_CHECKING:
-    from weighttraj.load.windows import WindowDataset
+    from weighttraj.load.windows import SnapshotDataset, WindowDataset
     from weighttraj.policies.policy import Policy
 
 
@@ -104,16 +105,19 @@ class StoredArray:
         return f"<{self._spec.name} {self.dtype} {dict(zip(self.dims, self.shape, strict=True))}>"
 
     def _check(self, index: Any, values: np.ndarray) -> None:
-        digests = np.atleast_2d(self._store.read("digest", index))
-        for i, row in enumerate(np.atleast_2d(values)):
-            if hashlib.sha256(row.astype("<f4").tobytes()).digest() != digests[i].tobytes():
-                raise DamageError(
-                    "a snapshot does not match its digest",
-                    expected=digests[i].tobytes().hex(),
-                    got=hashlib.sha256(row.astype("<f4").tobytes()).hexdigest(),
-                    where=f"{self._store.path}, row {i} of the rows read",
-                    do="restore the run's files from a copy, or collect the run again",
-                )
+        expected = np.atleast_2d(self._store.read("digest", index))
+        rows = np.ascontiguousarray(np.atleast_2d(values), "<f4")
+        got = b"".join([hashlib.sha256(row).digest() for row in rows])
+        if got == expected.tobytes():
+            return
+        bad = int(np.flatnonzero(np.frombuffer(got, np.uint8) != expected.reshape(-1))[0]) // 32
+        raise DamageError(
+            "a snapshot does not match its digest",
+            expected=expected[bad].tobytes().hex(),
+            got=got[32 * bad : 32 * bad + 32].hex(),
+            where=f"{self._store.path}, row {bad} of the rows read",
+            do="restore the run from a copy, or collect it again",
+        )
 
 
 class Run:
@@ -204,6 +208,33 @@ class Run:
         """Number of committed snapshots."""
         return self.info.n_committed
 
+    def keys(self) -> list[str]:
+        """Names of all arrays."""
+        return list(self._store.specs)
+
+    def at(self, num_timesteps: int) -> int:
+        """The last snapshot taken at or before so many environment steps.
+
+        >>> run.at(num_timesteps=100_000)  # doctest: +SKIP
+        240
+
+        Raises:
+            IndexError: there is none.
+        """
+        t = int(np.searchsorted(self.num_timesteps, num_timesteps, side="right")) - 1
+        if t < 0:
+            raise IndexError(f"run {self.id} has no snapshot at or before step {num_timesteps}")
+        return t
+
+    @property
+    def final_return(self) -> float:
+        """Mean return of the last training episodes (SB3's ``ep_rew_mean``); NaN: not stored."""
+        if "train/ep_rew_mean" not in self._store.specs:
+            return float("nan")
+        values = self["train/ep_rew_mean"][:]
+        finite = values[np.isfinite(values)]
+        return float(finite[-1]) if len(finite) else float("nan")
+
     def obs_norm(self, t: int) -> NormStats | None:
         """Statistics of the observation normaliser at snapshot t; None: the run has none."""
         return self._stats("obs_norm", t) if self.info.obs_norm is not None else None
@@ -261,6 +292,29 @@ class Dataset:
             )
         return Dataset(self.path, self.info, runs)
 
+    def select(self, **wanted: Any) -> Dataset:
+        """The runs that fit every condition.
+
+        Args:
+            wanted: ``env``, ``algorithm``, ``seed``, ``split``, ``status``, ``id``,
+                ``final_return`` or a hyper-parameter such as ``learning_rate``, each with the
+                value it must have, a collection it must be in, or a function that says whether
+                a value will do.
+
+        >>> ds.select(env="InvertedPendulum-v4", seed=range(10))  # doctest: +SKIP
+        >>> ds.select(final_return=lambda value: value > 900, n_epochs=10)  # doctest: +SKIP
+
+        Raises:
+            KeyError: no run knows of such a property.
+        """
+        facts = [_facts(run) for run in self.runs]
+        known = sorted(set().union(*facts))
+        if self.runs and (unknown := sorted(wanted.keys() - set(known))):
+            raise KeyError(f"runs of {self.info.id} have no {unknown}; they have {known}")
+        pairs = zip(self.runs, facts, strict=True)
+        runs = [r for r, f in pairs if all(_fits(f.get(k), v) for k, v in wanted.items())]
+        return Dataset(self.path, self.info, runs)
+
     def to_torch(self, window: int = 20, *, stride: int = 1) -> WindowDataset:
         """Windows of consecutive snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
 
@@ -270,8 +324,24 @@ class Dataset:
 
         return WindowDataset(self.runs, window=window, stride=stride)
 
+    def to_torch_snapshots(self, *, stride: int = 1) -> SnapshotDataset:
+        """Single snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
+
+        See ``weighttraj.load.SnapshotDataset``.
+        """
+        from weighttraj.load.windows import SnapshotDataset
+
+        return SnapshotDataset(self.runs, stride=stride)
+
     def __len__(self) -> int:
         return len(self.runs)
+
+    def __getitem__(self, run_id: str) -> Run:
+        """The run of an id."""
+        for run in self.runs:
+            if run.id == run_id:
+                return run
+        raise KeyError(f"no run {run_id!r}; there are {[run.id for run in self.runs]}")
 
     def __iter__(self) -> Iterator[Run]:
         return iter(self.runs)
@@ -282,7 +352,7 @@ class Dataset:
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a data set's folder.
+    """Open a data set: a folder, or one HDF5 file (``.h5``; needs the extra ``files``).
 
     A data set that is still being collected opens too, with the runs that exist so far.
 
@@ -292,6 +362,10 @@ def open_dataset(path: str | Path) -> Dataset:
         DamageError: it is complete but lacks a run that it lists.
     """
     path = Path(path)
+    if path.suffix == ".h5":
+        from weighttraj.format.hdf5 import open_hdf5
+
+        return open_hdf5(path)
     info = read_dataset_info(path)
     runs = []
     for entry in info.runs:
@@ -321,13 +395,27 @@ def open_run(path: str | Path) -> Run:
     return run
 
 
-def read_dataset_info(path: Path) -> DatasetInfo:
-    """Parse ``dataset.json``; raises as ``open_dataset`` does."""
-    file = path / "dataset.json"
-    if not file.is_file():
-        hint = "; this is one run: use open_run" if (path / "zarr.json").is_file() else ""
-        raise FileNotFoundError(f"no data set at {path}: it has no dataset.json{hint}")
-    return parse_json(file.read_bytes(), DatasetInfo, file)
+def _facts(run: Run) -> dict[str, Any]:
+    """What ``select`` can ask of a run."""
+    info = run.info
+    hyperparameters = info.algorithm.hyperparameters if info.algorithm else {}
+    return hyperparameters | {
+        "id": run.id,
+        "split": run.split,
+        "seed": info.seed,
+        "status": info.status,
+        "env": info.env.id if info.env else None,
+        "algorithm": info.algorithm.name if info.algorithm else None,
+        "final_return": run.final_return,
+    }
+
+
+def _fits(value: Any, wanted: Any) -> bool:
+    if callable(wanted):
+        return bool(wanted(value))
+    if isinstance(wanted, list | tuple | set | frozenset | range):
+        return value in wanted or value == wanted
+    return bool(value == wanted)
 
 
 def _rows(key: Any, n: int, where: str) -> Any:

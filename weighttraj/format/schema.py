@@ -26,6 +26,7 @@ AXES: tuple[Axis, ...] = ("time", "iteration")
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _MAX_ROW = 2**31  # elements; beyond it a snapshot is taken for damaged metadata
+_MAX_COUNT = 2**48
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,10 +184,12 @@ class RunInfo:
     def __post_init__(self) -> None:
         check_id(self.run_id, "run id")
         counts = (self.block - 1, self.n_committed, self.n_committed_iterations)
-        if min(*counts, self.probe_observations) < 0 or self.layout.size > _MAX_ROW:
+        counts = (*counts, self.probe_observations)
+        if min(counts) < 0 or max(counts) > _MAX_COUNT or self.layout.size > _MAX_ROW:
             raise FormatError(
                 "a count in the metadata is out of range",
-                expected="block at least 1, other counts at least 0, fewer than 2**31 parameters",
+                expected="block at least 1, other counts at least 0, at most 2**48, "
+                "at most 2**31 parameters",
                 got=f"block {self.block}, n_committed {self.n_committed}, "
                 f"n_committed_iterations {self.n_committed_iterations}, "
                 f"probe_observations {self.probe_observations}, {self.layout.size} parameters",
@@ -349,11 +352,6 @@ def parse(document: object, kind: type[T], where: object) -> T:
         ) from error
 
 
-def parse_json(text: bytes, kind: type[T], where: object) -> T:
-    """Parse JSON text; raises as ``parse`` does."""
-    return parse(load_json(text, where), kind, where)
-
-
 def load_json(text: bytes, where: object) -> Any:
     """Any JSON value.
 
@@ -361,7 +359,10 @@ def load_json(text: bytes, where: object) -> Any:
         FormatError: the text is no JSON.
     """
     try:
-        return json.loads(text)
+        value = json.loads(text.decode(), object_pairs_hook=_no_key_twice)
+        # NaN, infinite numbers and lone surrogates are Python's, not JSON's.
+        json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+        return value
     except (ValueError, RecursionError) as error:
         raise FormatError(
             "the metadata is no JSON",
@@ -369,6 +370,13 @@ def load_json(text: bytes, where: object) -> Any:
             where=where,
             do="restore the file from a copy; the arrays beside it may be whole",
         ) from error
+
+
+def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; readers do not agree on which of two equal keys counts."""
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError(f"a key is there twice, among {[key for key, _ in pairs][:20]}")
+    return dict(pairs)
 
 
 def to_json(info: RunInfo | DatasetInfo) -> dict[str, Any]:

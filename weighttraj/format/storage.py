@@ -1,12 +1,9 @@
-"""The arrays and metadata of one run as a Zarr group: read, write, commit."""
+"""The metadata and arrays of one run as a Zarr group, to be read."""
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +16,13 @@ from zarr.abc.store import (
     SuffixByteRequest,
 )
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
-from zarr.storage import LocalStore, MemoryStore
+from zarr.storage import MemoryStore
 
-from weighttraj.errors import DamageError, FormatError, MissingExtraError, StoreExistsError
-from weighttraj.format.codecs import check_array, create_array, quiet_codecs
-from weighttraj.format.objects import FolderObjects, Objects, ZipObjects
-from weighttraj.format.schema import ArraySpec, RunInfo, arrays_of, load_json, parse, to_json
+from weighttraj.errors import DamageError, FormatError, MissingExtraError
+from weighttraj.format.codecs import check_array, quiet_codecs
+from weighttraj.format.decode import RowDecoder
+from weighttraj.format.objects import FolderObjects, Objects, ZipObjects, check_name
+from weighttraj.format.schema import RunInfo, arrays_of, load_json, parse, to_json
 
 # Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
 _EMPTY_CHUNKS = {"array.write_empty_chunks": True}
@@ -51,6 +49,7 @@ class RunStore:
         self.specs = arrays_of(info)
         self.documents = documents
         self._readable: dict[str, zarr.Array[Any]] = {}
+        self._decoders: dict[str, RowDecoder | None] = {}
 
     @property
     def path(self) -> Path:
@@ -74,9 +73,15 @@ class RunStore:
         Raises:
             DamageError: a chunk is missing, or its checksum is wrong.
         """
+        decoder = self._decoder(name)
+        if decoder is not None and isinstance(key, int):
+            return np.asarray(decoder.read(key, key + 1)[0])
+        if decoder is not None and isinstance(key, slice) and key.step in (None, 1):
+            start, stop, _ = key.indices(self.info.committed(self.specs[name].axis))
+            return decoder.read(start, max(start, stop))
         array = self._array(name)
         key = key if isinstance(key, tuple) else (key,)
-        by_column = array.ndim == 2 and array.metadata.dimension_names[0] != self.specs[name].axis  # type: ignore[union-attr, index]
+        by_column = self._by_column(name)
         self._require(name, array, key[0], axis=1 if by_column else 0)
         if by_column:
             key = (key[1] if len(key) > 1 else slice(None), key[0])
@@ -125,149 +130,28 @@ class RunStore:
             if not self.objects.exists(key):
                 raise _missing(key, self.path)
 
+    def _by_column(self, name: str) -> bool:
+        """Whether rows are the last axis of an array, as in the archive profile."""
+        return bool(self.documents[name]["dimension_names"][0] != self.specs[name].axis)
+
+    def _decoder(self, name: str) -> RowDecoder | None:
+        if name not in self._decoders:
+            document, by_column = self.documents[name], self._by_column(name)
+            try:
+                decoder = RowDecoder(self.objects, name, document, by_column=by_column)
+            except NotImplementedError:
+                decoder = None
+            self._decoders[name] = decoder
+        return self._decoders[name]
+
     def _array(self, name: str) -> zarr.Array[Any]:
         if name not in self._readable:
             store = _CommittedStore(self.objects, name, self.documents[name])
-            self._readable[name] = _open_array(store, name, "r", str(self.path))
+            self._readable[name] = open_array(store, name, "r", str(self.path))
         return self._readable[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_readable": {}}
-
-
-class LiveStore(RunStore):
-    """A run in a folder, to be written."""
-
-    objects: FolderObjects
-
-    def __init__(self, objects: FolderObjects, info: RunInfo, documents: Documents) -> None:
-        super().__init__(objects, info, documents)
-        self._unsynced: set[Path] = set()
-        self._writable: dict[str, zarr.Array[Any]] = {}
-
-    @classmethod
-    def create(
-        cls, path: Path, info: RunInfo, packed_rows: dict[str, int] | None = None
-    ) -> LiveStore:
-        """Make an empty store; it appears under its name all at once.
-
-        Args:
-            path: folder to be made.
-            info: metadata.
-            packed_rows: rows of each axis in a run that is about to be packed.
-
-        Raises:
-            StoreExistsError: the path exists.
-        """
-        if path.exists():
-            raise StoreExistsError(
-                "the path to be written exists",
-                expected="a new path",
-                got="a folder" if path.is_dir() else "a file",
-                where=path,
-                do="choose another path, delete it, or continue the run with resume=True",
-            )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-        shutil.rmtree(draft, ignore_errors=True)
-        group = zarr.create_group(LocalStore(draft))
-        documents = {}
-        for name, spec in arrays_of(info).items():
-            rows = packed_rows[spec.axis] if packed_rows else None
-            create_array(group, spec, info.profile, info.block, rows)
-            documents[name] = json.loads((draft / name / "zarr.json").read_bytes())
-        store = cls(FolderObjects(draft), info, documents)
-        store.commit(info)
-        draft.rename(path)
-        sync(path.parent)
-        store.objects = FolderObjects(path)
-        return store
-
-    @classmethod
-    def open(cls, path: Path) -> LiveStore:
-        """Open a folder for writing. Rows that were written but not committed are forgotten.
-
-        Raises:
-            FileNotFoundError: there is no run at the path.
-            FormatError: it is no run of this format, or it is packed.
-        """
-        if path.name.endswith(PACKED):
-            raise FormatError("a packed run is finished; nothing can be added", where=path)
-        objects = FolderObjects(path)
-        store = cls(objects, *read_metadata(objects))
-        store.trim()
-        return store
-
-    def write(self, name: str, start: int, values: np.ndarray) -> None:
-        """Write rows of an array from ``start`` on, which begins a chunk; nothing is committed.
-
-        Every chunk is written whole and replaced atomically, then read back and compared.
-
-        Raises:
-            DamageError: what was read back is not what was written.
-        """
-        if name not in self._writable:
-            self._writable[name] = _open_array(LocalStore(self.path), name, "r+", str(self.path))
-        array = self._writable[name]
-        stop = start + len(values)
-        values = np.ascontiguousarray(values, array.dtype)
-        rows: Any = slice(start, stop)
-        if array.metadata.dimension_names[0] != self.specs[name].axis:  # type: ignore[union-attr, index]
-            if array.shape[1] < stop:
-                array.resize((array.shape[0], stop))
-            rows = (slice(None), rows)
-            values = np.ascontiguousarray(values.T)
-        elif array.shape[0] < stop:
-            array.resize((stop, *array.shape[1:]))
-        array[rows] = values
-        self._unsynced |= self._files(name, start, stop)
-        if np.asarray(array[rows]).tobytes() != values.tobytes():
-            raise DamageError(
-                "what was written reads back as something else",
-                where=f"{self.path}, array {name!r}, rows {start} to {stop}",
-                do="check the disk; nothing of this block was committed",
-            )
-
-    def commit(self, info: RunInfo) -> None:
-        """Make the metadata, and with it the committed rows, visible in one atomic replace.
-
-        What was written before is on the disk first, so that a power cut finds it there.
-        """
-        for path in self._unsynced:
-            sync(path)
-        self._unsynced.clear()
-        documents = copy.deepcopy(self.documents)
-        for name, spec in self.specs.items():
-            axis = documents[name]["dimension_names"].index(spec.axis)
-            documents[name]["shape"][axis] = info.committed(spec.axis)
-        replace_file(self.path / "zarr.json", group_document(info, documents))
-        self.info, self.documents = info, documents
-
-    def trim(self) -> None:
-        """Cut the arrays to the committed rows, so that plain Zarr shows nothing else."""
-        for name, content in member_documents(self.documents).items():
-            file = self.path / name
-            if not file.is_file() or file.read_bytes() != content:
-                replace_file(file, content)
-        self._writable.clear()
-
-    def _files(self, name: str, start: int, stop: int) -> set[Path]:
-        """Files and folders that hold some rows of an array."""
-        folder = self.path / name
-        if self.documents[name]["dimension_names"][0] == self.specs[name].axis:
-            size, inner = self.chunk_rows(name), "/0" * len(self.specs[name].inner)
-            chunks = range(start // size, -(-stop // size))
-            files = [folder / f"c/{chunk}{inner}" for chunk in chunks]
-            files = [file for file in files if file.exists()]
-        else:
-            files = [file for file in folder.rglob("*") if file.is_file()]
-        files.append(folder / "zarr.json")
-        root = len(self.path.parts)
-        parents = {Path(*f.parts[:n]) for f in files for n in range(root, len(f.parts))}
-        return {*files, *parents}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_writable": {}}
+        return {**self.__dict__, "_readable": {}, "_decoders": {}}
 
 
 class _CommittedStore(MemoryStore):
@@ -304,14 +188,15 @@ class _CommittedStore(MemoryStore):
 
 
 def objects_at(path: Path) -> FolderObjects | ZipObjects:
-    """The objects of a run in a folder or in a zip file.
+    """The objects of a run in a folder or in a zip file; a folder's name finds the file it became.
 
     Raises:
         FileNotFoundError: there is none.
         FormatError: it is a file, but no packed run.
     """
-    if path.is_file():
-        return ZipObjects(path)
+    packed = path.with_name(path.name + PACKED)
+    if path.is_file() or (packed.is_file() and not path.exists()):
+        return ZipObjects(path if path.is_file() else packed)
     if not (path / "zarr.json").is_file():
         raise FileNotFoundError(f"no run at {path}: it has no zarr.json")
     return FolderObjects(path)
@@ -350,16 +235,30 @@ def read_metadata(objects: Objects) -> tuple[RunInfo, Documents]:
             where=where,
             do="restore the file from a copy",
         )
-    try:
-        documents = document["consolidated_metadata"]["metadata"]
-        documents = {name: documents[name] for name in arrays_of(info)}
-    except (KeyError, TypeError) as error:
-        raise FormatError(
-            "the metadata lacks an array that the run has", got=error, where=where
-        ) from error
+    documents = _array_documents(document, where)
     for name, spec in arrays_of(info).items():
+        if name not in documents:
+            raise FormatError("the run lacks an array", expected=name, where=where)
         check_array(spec, documents[name], info.committed(spec.axis), f"{objects.path}, {name}")
     return info, documents
+
+
+def _array_documents(document: dict[str, Any], where: str) -> Documents:
+    """Metadata of all arrays, also of those that only a later version of this package reads."""
+    try:
+        nodes = document["consolidated_metadata"]["metadata"]
+        arrays = {name: node for name, node in nodes.items() if node["node_type"] == "array"}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FormatError(
+            "the run's metadata lack those of its arrays",
+            expected="Zarr's consolidated metadata",
+            got=repr(error),
+            where=where,
+            do="restore the file from a copy",
+        ) from error
+    for name in arrays:
+        check_name(name, where)
+    return arrays
 
 
 def group_document(info: RunInfo, documents: Documents) -> bytes:
@@ -401,26 +300,6 @@ def checksum(metadata: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file so that readers see the old content or the new, also after a power cut."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    with draft.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
-    sync(path.parent)
-
-
-def sync(path: Path) -> None:
-    """See a file or folder on the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def _missing(key: str, where: object) -> DamageError:
     return DamageError(
         "committed data is missing",
@@ -431,7 +310,13 @@ def _missing(key: str, where: object) -> DamageError:
     )
 
 
-def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:
+def open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:
+    """Open an array by Zarr.
+
+    Raises:
+        DamageError: its metadata cannot be parsed.
+        MissingExtraError: its codec is not installed.
+    """
     try:
         with zarr.config.set(_EMPTY_CHUNKS), quiet_codecs():
             return zarr.open_array(store, path=name, mode=mode, zarr_format=3)
@@ -448,6 +333,3 @@ def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]
             where=f"{where}, array {name!r}",
             do="restore the run from a copy",
         ) from error
-
-
-__all__ = ["ArraySpec", "LiveStore", "RunStore", "read_info", "replace_file"]

@@ -14,8 +14,17 @@ from filelock import FileLock, Timeout
 from jaxtyping import Float32
 
 from weighttraj.errors import FormatError, ReplayError, SnapshotError, StoreLockedError
-from weighttraj.format.schema import AXES, ArraySpec, Axis, RunInfo, Status, to_json, with_progress
-from weighttraj.format.storage import LiveStore
+from weighttraj.format.live import LiveStore
+from weighttraj.format.schema import (
+    AXES,
+    ArraySpec,
+    Axis,
+    Provenance,
+    RunInfo,
+    Status,
+    to_json,
+    with_progress,
+)
 
 Moments = tuple[np.ndarray, np.ndarray, float]
 """Statistics of a normaliser: mean, variance, count."""
@@ -47,7 +56,7 @@ class RunWriter:
     def __init__(self, path: str | Path, info: RunInfo, *, resume: bool = False) -> None:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = _lock(path)
+        self._lock = lock_run(path)
         try:
             if resume and path.exists():
                 self._store = _reopen(path, info)
@@ -56,6 +65,7 @@ class RunWriter:
         except BaseException:
             self._lock.release()
             raise
+        self._provenance = info.provenance
         info = self._store.info
         self.path = path
         self.replayed_from = info.n_committed
@@ -161,7 +171,6 @@ class RunWriter:
                     do="continue with the settings the run was started with",
                 )
             self.flush(status)
-            self._store.trim()
         finally:
             self._lock.release()
 
@@ -205,7 +214,8 @@ class RunWriter:
             raise ReplayError(
                 "the run does not repeat its committed snapshots",
                 expected=f"digest {self._committed_digests[n].tobytes().hex()[:16]}...",
-                got=f"digest {rows['digest'].tobytes().hex()[:16]}...",
+                got=f"digest {rows['digest'].tobytes().hex()[:16]}..., "
+                f"{explain_difference(self.info.provenance, self._provenance)}",
                 where=f"{self.path}, snapshot {n}",
                 do="continue on the machine, with the versions and the thread count that "
                 "run.info.provenance names, or collect under a new run id",
@@ -238,7 +248,12 @@ _ADAM = ("optimizer/exp_avg", "optimizer/exp_avg_sq")
 _MAY_BE_NAN = ("train/", "index/learning_rate")
 
 
-def _lock(path: Path) -> FileLock:
+def lock_run(path: Path) -> FileLock:
+    """The lock of a run, held: it has one writer.
+
+    Raises:
+        StoreLockedError: another process holds it.
+    """
     lock = FileLock(path.with_name(path.name + ".lock"))
     try:
         lock.acquire(timeout=0)
@@ -274,6 +289,25 @@ def _reopen(path: Path, info: RunInfo) -> LiveStore:
 
 
 _MAY_DIFFER = ("status", "n_committed", "n_committed_iterations", "provenance", "profile")
+
+
+def explain_difference(stored: Provenance, now: Provenance) -> str:
+    """What about two trainings could make them differ in bits, in words.
+
+    >>> explain_difference(Provenance(threads=1), Provenance(threads=4))
+    'in other circumstances: threads 1, now 4'
+    """
+    names = sorted(stored.packages | now.packages)
+    pairs = {
+        **{name: (stored.packages.get(name), now.packages.get(name)) for name in names},
+        "platform": (stored.platform, now.platform),
+        "cpu": (stored.cpu, now.cpu),
+        "threads": (stored.threads, now.threads),
+    }
+    other = [f"{name} {old}, now {new}" for name, (old, new) in pairs.items() if old != new]
+    if not other:
+        return "in the same circumstances: versions, processor and threads are equal"
+    return f"in other circumstances: {'; '.join(other)}"
 
 
 def _moments(name: str, moments: Moments | None) -> dict[str, Any]:

@@ -1,14 +1,29 @@
 """Stored trajectories as PyTorch data sets. Needs torch, which comes with the extra ``sb3``."""
 
-from weighttraj.errors import missing_extra
+from weighttraj.errors import CacheError, LoaderError, missing_extra
 
 try:
     import torch as _torch
 except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "sb3") from error
 
-from weighttraj.load.windows import SeededSampler, WindowDataset
+from weighttraj.load.cache import CachedWeights, cache_folder, cache_size, clear_cache
+from weighttraj.load.loader import LoaderState, ResumableLoader
+from weighttraj.load.windows import Batch, Item, SnapshotDataset, WindowDataset
 
-__all__ = ["SeededSampler", "WindowDataset"]
+__all__ = [
+    "Batch",
+    "CacheError",
+    "CachedWeights",
+    "Item",
+    "LoaderError",
+    "LoaderState",
+    "ResumableLoader",
+    "SnapshotDataset",
+    "WindowDataset",
+    "cache_folder",
+    "cache_size",
+    "clear_cache",
+]
 
 del _torch

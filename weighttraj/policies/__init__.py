@@ -4,13 +4,24 @@ from weighttraj.errors import missing_extra
 
 try:
     import gymnasium as _gymnasium
+    import stable_baselines3 as _stable_baselines3
     import torch as _torch
 except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "sb3") from error
 
+from weighttraj.policies.export import SB3Export, export_sb3
 from weighttraj.policies.policy import Policy, load_policy
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of, evaluate
 
-__all__ = ["EpisodeReturns", "Evaluator", "Policy", "env_of", "evaluate", "load_policy"]
+__all__ = [
+    "EpisodeReturns",
+    "Evaluator",
+    "Policy",
+    "SB3Export",
+    "env_of",
+    "evaluate",
+    "export_sb3",
+    "load_policy",
+]
 
-del _gymnasium, _torch
+del _gymnasium, _stable_baselines3, _torch

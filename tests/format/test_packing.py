@@ -1,0 +1,174 @@
+"""A packed run is the same run in one file, and our decoder reads what plain Zarr reads."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from zarr.storage import ZipStore
+
+import weighttraj as wt
+from tests.format.test_store import INFO, write
+from weighttraj.errors import DamageError, FormatError
+from weighttraj.format import ParamLayout, RunInfo, RunWriter
+from weighttraj.format.objects import ZipObjects
+from weighttraj.format.packing import same_as_packed
+from weighttraj.format.storage import RunStore, group_document, member_documents
+
+PROFILES = ("default", "archive")
+
+
+def wide(path: Path, n: int, columns: int, block: int = 4) -> wt.Run:
+    layout = ParamLayout.of({"w": ((columns,), "other", ("fixed",))})
+    rng = np.random.default_rng(0)
+    with RunWriter(path, RunInfo(run_id="wide", layout=layout, block=block)) as writer:
+        for t in range(n):
+            writer.append(rng.normal(size=columns).astype(np.float32), num_timesteps=t)
+    return wt.open_run(path)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_packing_keeps_every_array_bit_by_bit(tmp_path: Path, profile: str) -> None:
+    run = write(tmp_path / "run.zarr")
+    path = wt.pack(run.path, profile=profile)
+    assert path == tmp_path / "run.zarr.zip"
+    packed = wt.open_run(path)
+    assert packed.info == replace(run.info, profile=profile)
+    assert packed.keys() == run.keys()
+    for name, array in run.arrays.items():
+        assert packed[name][:].tobytes() == array[:].tobytes(), name
+    assert wt.verify(path) == []
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("columns", [16_384, 16_385, 40_000])
+def test_wide_runs_are_packed_in_several_chunks(tmp_path: Path, profile: str, columns: int) -> None:
+    run = wide(tmp_path / "wide.zarr", 70, columns)
+    packed = wt.open_run(wt.pack(run.path, profile=profile))
+    names = packed._store.objects.names
+    assert sum(name.startswith("policy/weights/c/") for name in names) > 1
+    assert np.array_equal(packed.weights[:], run.weights[:])
+    assert np.array_equal(packed.weights[33:61], run.weights[33:61])
+    assert np.array_equal(packed.weights[5:9, 16_380:16_384], run.weights[5:9, 16_380:16_384])
+    assert np.array_equal(packed.weights[[3, 69]], run.weights[[3, 69]])
+    assert np.array_equal(packed.weights[-1], run.weights[-1])
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    n=st.integers(1, 30),
+    columns=st.sampled_from([1, 3, 1025]),
+    block=st.integers(1, 9),
+    profile=st.sampled_from(PROFILES),
+    data=st.data(),
+)
+def test_both_decoders_give_the_same_rows(
+    tmp_path_factory: pytest.TempPathFactory,
+    n: int,
+    columns: int,
+    block: int,
+    profile: str,
+    data: st.DataObject,
+) -> None:
+    run = wide(tmp_path_factory.mktemp("wide") / "w.zarr", n, columns, block)
+    start = data.draw(st.integers(0, n))
+    stop = data.draw(st.integers(start, n))
+    for path in (run.path, wt.pack(run.path, profile=profile)):
+        store = RunStore.open(path)
+        array = store._array("policy/weights")
+        by_zarr = array[:].T if array.metadata.dimension_names[0] == "param" else array[:]
+        assert np.array_equal(store.read("policy/weights", slice(start, stop)), by_zarr[start:stop])
+
+
+def test_equal_runs_are_equal_files(tmp_path: Path) -> None:
+    one = wt.pack(write(tmp_path / "a/run.zarr").path)
+    other = wt.pack(write(tmp_path / "b/run.zarr").path)
+    assert one.read_bytes() == other.read_bytes()
+    again = wt.pack(one, out=tmp_path / "again.zip")
+    assert one.read_bytes() == again.read_bytes()
+    assert same_as_packed(one)
+
+
+def test_only_finished_runs_are_packed(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.zarr", INFO)
+    with pytest.raises(FormatError, match="only a finished run"):
+        wt.pack(tmp_path / "run.zarr")
+    writer.close("crashed")
+    assert wt.open_run(wt.pack(tmp_path / "run.zarr")).info.status == "crashed"
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "run.zarr",
+        "run.zarr.lock",
+        "run.zarr.zip",
+    ]
+
+
+def test_a_packed_run_takes_no_more_snapshots(tmp_path: Path) -> None:
+    path = wt.pack(write(tmp_path / "run.zarr").path)
+    with pytest.raises(FormatError, match="packed run is finished"):
+        RunWriter(path, INFO, resume=True)
+
+
+def test_the_path_of_a_folder_finds_the_file_it_became(tmp_path: Path) -> None:
+    run = write(tmp_path / "run.zarr")
+    wt.pack(run.path)
+    os.rename(run.path, tmp_path / "elsewhere")
+    assert wt.open_run(tmp_path / "run.zarr").path == tmp_path / "run.zarr"
+    assert len(wt.open_run(tmp_path / "run.zarr")) == 20
+
+
+def test_every_byte_of_a_packed_run_counts(tmp_path: Path) -> None:
+    """Also those of the zip file's own headers, which no reader looks at."""
+    path = wt.pack(write(tmp_path / "run.zarr").path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    places = [*rng.integers(0, len(whole), 60), *range(30), *range(len(whole) - 22, len(whole))]
+    for place in places:
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(flipped))
+        assert wt.verify(path), place
+
+
+def test_a_truncated_file_is_found_when_it_is_opened(tmp_path: Path) -> None:
+    path = wt.pack(write(tmp_path / "run.zarr").path)
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(DamageError, match="no whole zip file"):
+        wt.open_run(path)
+
+
+def test_arrays_of_a_later_version_are_read_over_and_not_lost(tmp_path: Path) -> None:
+    """Readers ignore arrays that they do not know; packing them anew would lose them."""
+    run = write(tmp_path / "run.zarr")
+    store = run._store
+    documents = {**store.documents, "eval/later": store.documents["index/phase"]}
+    (run.path / "eval").mkdir()
+    for name, content in member_documents(documents).items():
+        (run.path / name).parent.mkdir(exist_ok=True)
+        (run.path / name).write_bytes(content)
+    (run.path / "eval/later/c").mkdir()
+    for file in (run.path / "index/phase/c").iterdir():
+        (run.path / "eval/later/c" / file.name).write_bytes(file.read_bytes())
+    (run.path / "zarr.json").write_bytes(group_document(run.info, documents))
+    assert wt.verify(run.path) == []
+    assert "eval/later" not in wt.open_run(run.path).arrays
+    with pytest.raises(FormatError, match=r"(?s)does not know.*eval/later"):
+        wt.pack(run.path)
+
+
+def test_plain_zarr_reads_a_packed_run(tmp_path: Path) -> None:
+    run = write(tmp_path / "run.zarr")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Numcodecs codecs are not in")
+        for profile in PROFILES:
+            store = ZipStore(wt.pack(run.path, profile=profile))
+            weights = zarr.open(store, mode="r")["policy/weights"][:]
+            store.close()
+            assert np.array_equal(weights.T if profile == "archive" else weights, run.weights[:])
+    assert ZipObjects(tmp_path / "run.zarr.zip").names[0] == "zarr.json"

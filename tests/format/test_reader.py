@@ -1,0 +1,64 @@
+"""Finding runs and snapshots in a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import weighttraj as wt
+from weighttraj.errors import DamageError
+
+
+def ids(dataset: wt.Dataset) -> list[str]:
+    return [run.id for run in dataset]
+
+
+def test_runs_are_selected_by_what_they_are(small_dataset: Path) -> None:
+    ds = wt.open(small_dataset)
+    assert ids(ds.select(seed=2)) == ["seed0002"]
+    assert ids(ds.select(seed=range(1, 3))) == ["seed0001", "seed0002"]
+    assert ids(ds.select(env="InvertedPendulum-v4", algorithm="PPO", split="train")) == [
+        "seed0000",
+        "seed0001",
+    ]
+    assert ids(ds.select(n_epochs=2, batch_size=lambda size: size > 8)) == ids(ds)
+    assert ids(ds.select(gamma=0.5)) == []
+    best = max(run.final_return for run in ds)
+    assert [r.final_return for r in ds.select(final_return=lambda value: value >= best)] == [best]
+    with pytest.raises(KeyError, match=r"no \['gama'\].*'gamma'"):
+        ds.select(gama=0.5)
+
+
+def test_runs_are_found_by_id(small_dataset: Path) -> None:
+    ds = wt.open(small_dataset)
+    assert ds["seed0002"].info.seed == 2
+    with pytest.raises(KeyError, match="seed0000"):
+        ds["seed9"]
+
+
+def test_the_snapshot_at_an_environment_step(small_dataset: Path) -> None:
+    run = wt.open(small_dataset).runs[0]
+    assert run.at(num_timesteps=0) == 0
+    assert run.at(num_timesteps=63) == 0
+    last_of_first_iteration = np.flatnonzero(run.num_timesteps == 64)[-1]
+    assert run.at(num_timesteps=64) == run.at(num_timesteps=127) == last_of_first_iteration
+    assert run.at(num_timesteps=10**9) == len(run) - 1
+    with pytest.raises(IndexError, match="no snapshot at or before step -1"):
+        run.at(num_timesteps=-1)
+
+
+def test_runs_are_opened_when_they_are_used(small_dataset: Path, tmp_path: Path) -> None:
+    """So that a data set of many runs opens in no time, and one bad run does not hide the rest."""
+    for file in small_dataset.rglob("*"):
+        if file.is_file():
+            copy = tmp_path / file.relative_to(small_dataset)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(file.read_bytes())
+    (tmp_path / "runs/seed0000.zarr.zip").write_bytes(b"no zip file")
+    ds = wt.open(tmp_path)
+    assert ids(ds) == ["seed0000", "seed0001", "seed0002", "seed0003"]
+    assert len(ds["seed0001"]) == 49
+    with pytest.raises(DamageError, match="no whole zip file"):
+        len(ds["seed0000"])

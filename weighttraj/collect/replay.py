@@ -1,0 +1,94 @@
+"""Does a stored run come from the training it names? Trains its first snapshots again."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+
+from weighttraj.collect.callback import WeightTrajectoryCallback
+from weighttraj.collect.describe import describe_provenance
+from weighttraj.collect.ppo import make_ppo
+from weighttraj.collect.recipe import Recipe
+from weighttraj.errors import CollectError
+from weighttraj.format import Run, open_dataset, open_run
+from weighttraj.format.writer import explain_difference
+
+
+def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
+    """Train the first n snapshots of a run again and compare them with the stored ones.
+
+    Args:
+        path: data set that was collected from a recipe.
+        n: snapshots to be compared; all of the run's if it has fewer.
+        seed: which run; None: the first.
+
+    Returns:
+        What differs, in words; an empty list means that every snapshot came out bit by bit.
+
+    Raises:
+        CollectError: the data set has no recipe, or no run of this seed.
+    """
+    dataset = open_dataset(path)
+    runs = [run for run in dataset if seed is None or run.info.seed == seed]
+    if not runs or not dataset.info.recipe:
+        raise CollectError(
+            "there is nothing to train again",
+            expected="a data set with its recipe, and a run of the seed",
+            got=f"seeds {[run.info.seed for run in dataset]}, "
+            f"{'a' if dataset.info.recipe else 'no'} recipe",
+            where=path,
+            do="choose one of the seeds",
+        )
+    recipe = msgspec.convert(dataset.info.recipe, Recipe)
+    return _compare(runs[0], recipe, min(n, len(runs[0])))
+
+
+def _compare(run: Run, recipe: Recipe, n: int) -> list[str]:
+    stored = run["digest"][:n]
+    with tempfile.TemporaryDirectory() as folder:
+        again = _train(run, recipe, n, Path(folder) / f"{run.id}.zarr")["digest"][:n]
+    differing = np.flatnonzero((stored[: len(again)] != again).any(axis=1))
+    if len(again) == n and not differing.size:
+        return []
+    first = int(differing[0]) if differing.size else len(again)
+    reason = explain_difference(run.info.provenance, describe_provenance())
+    return [
+        f"{run.path}: trained again, snapshot {first} of {n} is the first that differs; "
+        f"stored {reason}"
+    ]
+
+
+def _train(run: Run, recipe: Recipe, n: int, path: Path) -> Run:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(run.info.provenance.threads or 1)
+    config, every = recipe.ppo, recipe.store.every
+    cadence = run.info.cadence
+    steps = (cadence.gradient_steps_per_iteration if cadence else None) or 1
+    iterations = math.ceil((n - 1) * every / steps)
+    recorder = WeightTrajectoryCallback(path, every=every, probe_observations=0)
+    try:
+        # The schedules need the whole length, so the training is cut short, not shortened.
+        stop = _StopAfter(iterations * config.n_steps)
+        model = make_ppo(config, seed=run.info.seed or 0)
+        model.learn(config.n_iterations * config.n_steps, callback=[recorder, stop])
+    finally:
+        recorder.close()
+        torch.set_num_threads(threads)
+    return open_run(path)
+
+
+class _StopAfter(BaseCallback):
+    """Ends training in the first rollout after so many environment steps."""
+
+    def __init__(self, num_timesteps: int) -> None:
+        super().__init__()
+        self._limit = num_timesteps
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps <= self._limit

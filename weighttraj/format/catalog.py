@@ -1,0 +1,169 @@
+"""What makes runs a data set: ``dataset.json`` lists them, ``MANIFEST.sha256`` every object."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from weighttraj.errors import DamageError
+from weighttraj.format.objects import FolderObjects, check_name, replace_file
+from weighttraj.format.schema import DatasetInfo, load_json, parse, to_json
+from weighttraj.format.storage import checksum
+
+DATASET = "dataset.json"
+MANIFEST = "MANIFEST.sha256"
+
+_LINE = re.compile(r"([0-9a-f]{64})  ([0-9]{1,15})  (\S+)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManifestLine:
+    """One object of a data set."""
+
+    sha256: str
+    """Hash of its bytes, hexadecimal."""
+    size: int
+    """Bytes."""
+    path: str
+    """Path from the data set's folder, with forward slashes."""
+
+
+def read_dataset_info(path: Path) -> DatasetInfo:
+    """The checked list of a data set's runs.
+
+    Raises:
+        FileNotFoundError: there is no data set at the path.
+        FormatError: it is none of this format.
+        DamageError: it does not match its checksum.
+    """
+    file = path / DATASET
+    if not file.is_file():
+        one = path.is_file() or (path / "zarr.json").is_file()
+        hint = "; this is one run: use open_run" if one else ""
+        raise FileNotFoundError(f"no data set at {path}: it has no {DATASET}{hint}")
+    return parse_dataset(FolderObjects(path).read(DATASET) or b"", file)
+
+
+def parse_dataset(content: bytes, where: object) -> DatasetInfo:
+    """The list of runs in ``dataset.json``; raises as ``read_dataset_info`` does."""
+    document = load_json(content, where)
+    stored = document.pop("sha256", None) if isinstance(document, dict) else None
+    info = parse(document, DatasetInfo, where)
+    if stored != checksum(document):
+        raise DamageError(
+            "the list of runs does not match its checksum",
+            expected=stored,
+            got=checksum(document),
+            where=where,
+            do="restore the file from a copy; it is not to be edited by hand",
+        )
+    return info
+
+
+def dataset_document(info: DatasetInfo) -> bytes:
+    """``dataset.json`` with its checksum."""
+    document = to_json(info)
+    return json.dumps(document | {"sha256": checksum(document)}, indent=1).encode()
+
+
+def write_dataset_info(path: Path, info: DatasetInfo) -> None:
+    """Replace ``dataset.json``."""
+    replace_file(path / DATASET, dataset_document(info))
+
+
+def write_manifest(path: Path) -> None:
+    """Write down every object of a data set; nothing may change after it."""
+    lines = []
+    for name in sorted(_objects(path)):
+        line = _line(FolderObjects(path), name)
+        lines.append(f"{line.sha256}  {line.size}  {line.path}\n")
+    replace_file(path / MANIFEST, "".join(lines).encode())
+
+
+def read_manifest(path: Path) -> list[ManifestLine]:
+    """Lines of the manifest.
+
+    Raises:
+        DamageError: it is missing, or a line is not as the format has it.
+        FormatError: a path leads out of the data set.
+    """
+    file = path / MANIFEST
+    content = FolderObjects(path).read(MANIFEST)
+    try:
+        if content is None:
+            raise FileNotFoundError(MANIFEST)
+        text = content.decode("ascii")
+    except (FileNotFoundError, UnicodeDecodeError) as error:
+        raise DamageError(
+            "the data set is complete, but its manifest is missing or damaged",
+            expected=MANIFEST,
+            got=error,
+            where=path,
+            do="restore it from a copy, or write it again: weighttraj repair",
+        ) from error
+    lines = []
+    for number, line in enumerate(text.split("\n")[:-1], start=1):
+        match = _LINE.fullmatch(line)
+        if match is None or not text.endswith("\n"):
+            raise DamageError(
+                "a line of the manifest is damaged",
+                expected="sha256, size and path, two spaces between them",
+                got=repr(line),
+                where=f"{file}, line {number}",
+                do="restore it from a copy, or write it again: weighttraj repair",
+            )
+        lines.append(
+            ManifestLine(
+                sha256=match[1], size=int(match[2]), path=check_name(match[3], f"{file}:{number}")
+            )
+        )
+    paths = [line.path for line in lines]
+    if paths != sorted(set(paths)):
+        raise DamageError(
+            "the lines of the manifest are not in order, or a path is there twice",
+            where=file,
+            do="restore it from a copy, or write it again: weighttraj repair",
+        )
+    return lines
+
+
+def check_manifest(path: Path) -> list[str]:
+    """Objects that are missing, changed or not in the manifest, in words."""
+    lines = read_manifest(path)
+    present = set(_objects(path))
+    problems = []
+    for line in lines:
+        where = path / line.path
+        if line.path not in present:
+            problems.append(f"{where}: missing, the manifest lists it")
+            continue
+        present.discard(line.path)
+        got = _line(FolderObjects(path), line.path)
+        if got != line:
+            problems.append(
+                f"{where}: changed; expected {line.size} bytes, sha256 {line.sha256[:16]}..., "
+                f"got {got.size} bytes, {got.sha256[:16]}..."
+            )
+    problems += [f"{path / name}: not in the manifest" for name in sorted(present)]
+    return problems
+
+
+def _objects(path: Path) -> Iterator[str]:
+    """Every object of a data set but the manifest; drafts and locks are none."""
+    for folder, folders, files in os.walk(path):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in files:
+            file = Path(folder, name)
+            if not name.startswith(".") and not name.endswith(".lock") and name != MANIFEST:
+                yield file.relative_to(path).as_posix()
+
+
+def _line(objects: FolderObjects, name: str) -> ManifestLine:
+    with open(objects.file(name), "rb") as content:
+        digest = hashlib.file_digest(content, "sha256").hexdigest()
+        return ManifestLine(sha256=digest, size=content.tell(), path=name)

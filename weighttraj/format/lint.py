@@ -1,0 +1,157 @@
+"""Is a run what it says it is? Looks for what is whole, byte by byte, and yet suspicious."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from weighttraj.format.reader import Run, open_dataset, open_run
+
+JUMP = 30.0
+"""A step is a discontinuity if it is so many times the median of the steps around it."""
+
+AROUND = 25
+"""Steps before and after that a step is compared with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something that a careful reader would ask about."""
+
+    check: str
+    """Name of the check."""
+    run: str
+    """Id of the run."""
+    message: str
+    """What was found, and what it may mean."""
+
+    def __str__(self) -> str:
+        return f"{self.run}: {self.check}: {self.message}"
+
+
+def lint(path: str | Path) -> list[Finding]:
+    """What is suspicious about a data set or run; an empty list means nothing.
+
+    Checks: ``duplicate`` (snapshots that equal another one), ``final`` (snapshots that equal the
+    last one, as when a mirror serves final weights under every name), ``gap`` (counters that do
+    not follow the cadence), ``order`` (counters that go back), ``jump`` (a step far longer than
+    those around it), ``finite``, ``constant`` (parameters that never change), ``normalizer`` (an
+    agent without recorded normaliser), ``short`` (fewer snapshots than the other runs have),
+    ``twin`` (runs with the same weights).
+
+    Raises:
+        FileNotFoundError: there is neither a data set nor a run at the path.
+        DamageError: it is not whole: see ``verify``.
+    """
+    path = Path(path)
+    runs = open_dataset(path).runs if (path / "dataset.json").is_file() else [open_run(path)]
+    findings = [finding for run in runs for finding in lint_run(run)]
+    return findings + list(_between(runs))
+
+
+def lint_run(run: Run) -> list[Finding]:
+    """What is suspicious about one run."""
+    if not len(run):
+        return [Finding(check="short", run=run.id, message="no snapshots")]
+    found = [*_duplicates(run), *_counters(run), *_weights(run), *_normalizer(run)]
+    return [Finding(check=check, run=run.id, message=message) for check, message in found]
+
+
+def _duplicates(run: Run) -> Iterator[tuple[str, str]]:
+    seen: dict[bytes, int] = {}
+    digests = [row.tobytes() for row in run["digest"][:]]
+    final = [t for t, digest in enumerate(digests[:-1]) if digest == digests[-1]]
+    if final:
+        yield "final", f"{_some(final)} equal the last snapshot"
+    pairs = []
+    for t, digest in enumerate(digests):
+        if digest in seen:
+            pairs.append((seen[digest], t))
+        seen[digest] = t
+    if pairs:
+        yield "duplicate", f"equal snapshots {_some(pairs)}: did training stand still?"
+
+
+def _counters(run: Run) -> Iterator[tuple[str, str]]:
+    for name in ("iteration", "gradient_step", "num_timesteps"):
+        values = run[f"index/{name}"][:]
+        back = np.flatnonzero(np.diff(values) < 0) + 1
+        if back.size:
+            yield "order", f"{name} goes back at {_some(back.tolist())}"
+    cadence, steps = run.info.cadence, run["index/gradient_step"][:]
+    if cadence is None or (steps < 0).any():
+        return
+    # The last snapshot is that of the end, wherever the cadence was.
+    gaps = np.flatnonzero(np.diff(steps)[:-1] != cadence.every) + 1
+    if gaps.size:
+        yield "gap", f"not {cadence.every} gradient steps before {_some(gaps.tolist())}"
+
+
+def _weights(run: Run) -> Iterator[tuple[str, str]]:
+    first = run.weights[0]
+    moved = np.zeros(first.shape, bool)
+    lengths, bad, last = [], [], first[None].astype(np.float64)
+    for start in range(0, len(run), 512):
+        rows = run.weights[start : start + 512]
+        moved |= (rows != first).any(axis=0)
+        bad += (start + np.flatnonzero(~np.isfinite(rows).all(axis=1))).tolist()
+        steps = np.diff(rows.astype(np.float64), axis=0, prepend=last)
+        lengths.append(np.linalg.norm(steps, axis=1))
+        last = rows[-1:].astype(np.float64)
+    if bad:
+        yield "finite", f"NaN or infinite weights at {_some(bad)}"
+    if len(run) > 1 and not moved.all():
+        names = [s.name for s in run.layout.params if not moved[s.slice].all()]
+        still = int((~moved).sum())
+        yield "constant", f"{still} of {moved.size} parameters never change, in {names}"
+    jumps = _jumps(np.concatenate(lengths)[1:])
+    if jumps:
+        yield "jump", f"steps {JUMP:g} times longer than those around them end at {_some(jumps)}"
+
+
+def _jumps(lengths: np.ndarray) -> list[int]:
+    """Snapshots that end a step far longer than the median of its surroundings."""
+    found = []
+    for t, length in enumerate(lengths):
+        around = lengths[max(0, t - AROUND) : t + AROUND + 1]
+        usual = np.median(around[around > 0]) if (around > 0).any() else 0.0
+        if length > JUMP * usual > 0:
+            found.append(t + 1)
+    return found
+
+
+def _normalizer(run: Run) -> Iterator[tuple[str, str]]:
+    info = run.info
+    if info.obs_norm is None and info.env is not None:
+        named = [w for w in info.env.wrappers if "normaliz" in w.lower()]
+        if named:
+            yield "normalizer", f"wrappers {named} normalise, but no statistics are stored"
+
+
+def _between(runs: Sequence[Run]) -> Iterator[Finding]:
+    lengths = defaultdict(list)
+    ends = defaultdict(list)
+    for run in runs:
+        lengths[len(run)].append(run.id)
+        if len(run):
+            ends[run["digest"][-1].tobytes()].append(run.id)
+    usual = max(lengths, key=lambda n: len(lengths[n]), default=0)
+    for n, ids in lengths.items():
+        for run_id in ids if n < usual else ():
+            message = f"{n} snapshots, where most runs have {usual}"
+            yield Finding(check="short", run=run_id, message=message)
+    for ids in ends.values():
+        if len(ids) > 1:
+            yield Finding(check="twin", run=ids[0], message=f"ends in the weights of {ids[1:]}")
+
+
+def _some(values: Sequence[object]) -> str:
+    shown = ", ".join(map(str, values[:5]))
+    return shown if len(values) <= 5 else f"{shown} and {len(values) - 5} more"
+
+
+__all__ = ["Finding", "lint", "lint_run"]

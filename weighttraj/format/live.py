@@ -1,0 +1,197 @@
+"""The metadata and arrays of one run in a folder, to be written: blocks, then a commit."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.storage import LocalStore
+
+from weighttraj.errors import DamageError, FormatError, StoreExistsError
+from weighttraj.format.codecs import create_array
+from weighttraj.format.objects import FolderObjects, replace_file, sync
+from weighttraj.format.schema import RunInfo, arrays_of
+from weighttraj.format.storage import (
+    PACKED,
+    Documents,
+    RunStore,
+    array_document,
+    group_document,
+    member_documents,
+    open_array,
+    read_metadata,
+)
+
+
+class LiveStore(RunStore):
+    """A run in a folder, to be written."""
+
+    objects: FolderObjects
+
+    def __init__(self, objects: FolderObjects, info: RunInfo, documents: Documents) -> None:
+        super().__init__(objects, info, documents)
+        self._unsynced: set[Path] = set()
+        self._writable: dict[str, zarr.Array[Any]] = {}
+
+    @classmethod
+    def create(
+        cls, path: Path, info: RunInfo, packed_rows: dict[str, int] | None = None
+    ) -> LiveStore:
+        """Make an empty store; it appears under its name all at once.
+
+        Args:
+            path: folder to be made.
+            info: metadata.
+            packed_rows: rows of each axis in a run that is about to be packed.
+
+        Raises:
+            StoreExistsError: the path exists.
+        """
+        if path.exists():
+            raise StoreExistsError(
+                "the path to be written exists",
+                expected="a new path",
+                got="a folder" if path.is_dir() else "a file",
+                where=path,
+                do="choose another path, delete it, or continue the run with resume=True",
+            )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
+        shutil.rmtree(draft, ignore_errors=True)
+        group = zarr.create_group(LocalStore(draft))
+        documents = {}
+        for name, spec in arrays_of(info).items():
+            rows = packed_rows[spec.axis] if packed_rows else None
+            create_array(group, spec, info.profile, info.block, rows)
+            documents[name] = json.loads((draft / name / "zarr.json").read_bytes())
+        store = cls(FolderObjects(draft), info, documents)
+        store.commit(info)
+        draft.rename(path)
+        sync(path.parent)
+        store.objects = FolderObjects(path)
+        return store
+
+    @classmethod
+    def open(cls, path: Path) -> LiveStore:
+        """Open a folder for writing. Rows that were written but not committed are forgotten.
+
+        Raises:
+            FileNotFoundError: there is no run at the path.
+            FormatError: it is no run of this format, or it is packed.
+        """
+        if path.name.endswith(PACKED):
+            raise FormatError("a packed run is finished; nothing can be added", where=path)
+        objects = FolderObjects(path)
+        store = cls(objects, *read_metadata(objects))
+        store.write_members()
+        return store
+
+    def write(self, name: str, start: int, values: np.ndarray) -> None:
+        """Write rows of an array from ``start`` on, which begins a chunk; nothing is committed.
+
+        Every chunk is written whole and replaced atomically, then read back and compared.
+
+        Raises:
+            DamageError: what was read back is not what was written.
+        """
+        if name not in self._writable:
+            store = _BlockStore(self.path, name, self.documents[name])
+            self._writable[name] = open_array(store, name, "r+", str(self.path))
+        array = self._writable[name]
+        stop = start + len(values)
+        values = np.ascontiguousarray(values, array.dtype)
+        rows: Any = slice(start, stop)
+        if self._by_column(name):
+            if array.shape[1] < stop:
+                array.resize((array.shape[0], stop))
+            rows = (slice(None), rows)
+            values = np.ascontiguousarray(values.T)
+        elif array.shape[0] < stop:
+            array.resize((stop, *array.shape[1:]))
+        array[rows] = values
+        self._unsynced |= self._files(name, start, stop)
+        if np.asarray(array[rows]).tobytes() != values.tobytes():
+            raise DamageError(
+                "what was written reads back as something else",
+                where=f"{self.path}, array {name!r}, rows {start} to {stop}",
+                do="check the disk; nothing of this block was committed",
+            )
+
+    def commit(self, info: RunInfo) -> None:
+        """Make the metadata, and with it the committed rows, visible in one atomic replace.
+
+        What was written before is on the disk first, so that a power cut finds it there.
+        """
+        for path in self._unsynced:
+            sync(path)
+        self._unsynced.clear()
+        documents = copy.deepcopy(self.documents)
+        for name, spec in self.specs.items():
+            axis = documents[name]["dimension_names"].index(spec.axis)
+            documents[name]["shape"][axis] = info.committed(spec.axis)
+        replace_file(self.path / "zarr.json", group_document(info, documents))
+        self.info, self.documents = info, documents
+        self._readable.clear()
+        self._decoders.clear()
+        self.write_members()
+
+    def write_members(self) -> None:
+        """Write the metadata of groups and arrays where they differ from the run's.
+
+        Readers of single arrays look there; those of the run, here or in plain Zarr, do not.
+        """
+        for name, content in member_documents(self.documents).items():
+            file = Path(self.objects.file(name))  # no link that leads elsewhere
+            if not file.is_file() or file.read_bytes() != content:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(file, content, durable=False)
+
+    def _files(self, name: str, start: int, stop: int) -> set[Path]:
+        """Files and folders that hold some rows of an array."""
+        folder = self.path / name
+        if not self._by_column(name):
+            size, inner = self.chunk_rows(name), "/0" * len(self.specs[name].inner)
+            chunks = range(start // size, -(-stop // size))
+            files = [folder / f"c/{chunk}{inner}" for chunk in chunks]
+            files = [file for file in files if file.exists()]
+        else:
+            files = [file for file in folder.rglob("*") if file.is_file()]
+        root = len(self.path.parts)
+        parents = {Path(*f.parts[:n]) for f in files for n in range(root, len(f.parts))}
+        return {*files, *parents}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_writable": {}}
+
+
+class _BlockStore(LocalStore):
+    """One array that grows: chunks go to the disk, its metadata wait for the commit."""
+
+    def __init__(self, root: Path, name: str, document: dict[str, Any]) -> None:
+        super().__init__(root)
+        self._metadata = {f"{name}/zarr.json": array_document(document)}
+
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        if key in self._metadata:
+            return default_buffer_prototype().buffer.from_bytes(self._metadata[key])
+        return await super().get(key, prototype, byte_range)
+
+    async def set(self, key: str, value: Buffer) -> None:
+        if key in self._metadata:
+            self._metadata[key] = value.to_bytes()
+        else:
+            FolderObjects(self.root).file(key)  # no link that leads elsewhere
+            await super().set(key, value)
