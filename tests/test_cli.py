@@ -51,6 +51,43 @@ def test_verify_fails_on_damage(tmp_path: Path) -> None:
     assert "expected: the object policy/weights/c/0/0" in done.stdout
 
 
+def test_a_data_set_goes_out_and_comes_back(small_dataset: Path, tmp_path: Path) -> None:
+    file = tmp_path / "small.h5"
+    assert run("weighttraj", "export", small_dataset, "--to", "hdf5", "--out", file).returncode == 0
+    assert "4 runs" in run("weighttraj", "show", file).stdout
+    assert run("weighttraj", "import", file, "--out", tmp_path / "back").returncode == 0
+    done = run("weighttraj", "verify", tmp_path / "back", "--deep", "--replay", 5)
+    assert done.stdout.strip().endswith("back: whole")
+    assert "nothing suspicious" in run("weighttraj", "lint", tmp_path / "back").stdout
+
+
+def test_repair_mends_and_cuts(tmp_path: Path) -> None:
+    layout = wt.ParamLayout.of({"w": ((3,), "other", ("fixed",))})
+    with wt.RunWriter(
+        tmp_path / "r.zarr", wt.RunInfo(run_id="r", layout=layout, block=2)
+    ) as writer:
+        for t in range(5):
+            writer.append(layout.flatten({"w": [t, 2, 3]}), num_timesteps=t)
+    (tmp_path / "r.zarr/policy/weights/c/1/0").write_bytes(b"")
+    (tmp_path / "r.zarr/index/phase/zarr.json").unlink()
+    done = run("weighttraj", "repair", tmp_path / "r.zarr")
+    assert done.returncode == 1
+    assert "mended" in done.stdout
+    assert "damaged after row 2 of 5; --cut drops what follows" in " ".join(done.stdout.split())
+    done = run("weighttraj", "repair", tmp_path / "r.zarr", "--cut")
+    assert done.returncode == 0
+    assert len(wt.open_run(tmp_path / "r.zarr")) == 2
+
+
+def test_pack_and_cache(small_dataset: Path, tmp_path: Path) -> None:
+    source = small_dataset / "runs/seed0000.zarr.zip"
+    out = tmp_path / "small.zarr.zip"
+    done = run("weighttraj", "pack", source, "--profile", "archive", "--out", out)
+    assert done.stdout.strip() == str(out)
+    assert wt.open_run(out).info.profile == "archive"
+    assert "MB" in run("weighttraj", "cache").stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

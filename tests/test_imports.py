@@ -20,7 +20,16 @@ ALLOWED = {
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
     "weighttraj.format.objects": ["weighttraj.errors"],
     "weighttraj.format.codecs": ["weighttraj.errors", "weighttraj.format.schema"],
-    "weighttraj.format.decode": ["weighttraj.errors", "weighttraj.format.objects"],
+    "weighttraj.format.decode": [
+        "weighttraj.errors",
+        "weighttraj.format.codecs",
+        "weighttraj.format.objects",
+    ],
+    "weighttraj.format.encode": [
+        "weighttraj.errors",
+        "weighttraj.format.codecs",
+        "weighttraj.format.schema",
+    ],
     "weighttraj.format.storage": [
         "weighttraj.errors",
         "weighttraj.format.codecs",
@@ -31,6 +40,7 @@ ALLOWED = {
     "weighttraj.format.live": [
         "weighttraj.errors",
         "weighttraj.format.codecs",
+        "weighttraj.format.encode",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
@@ -64,6 +74,7 @@ ALLOWED = {
         "weighttraj.errors",
         "weighttraj.format.catalog",
         "weighttraj.format.layout",
+        "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
         "later weighttraj.format.hdf5",
@@ -111,7 +122,12 @@ ALLOWED = {
     ],
     "weighttraj.load.loader": ["weighttraj.errors", "weighttraj.load.windows"],
     "weighttraj.load": ["weighttraj.errors", "weighttraj.load"],
-    "weighttraj.cli": ["door weighttraj", "weighttraj.errors", "later weighttraj.collect.recipe"],
+    "weighttraj.cli": [
+        "door weighttraj",
+        "weighttraj.errors",
+        "later weighttraj.collect.recipe",
+        "later weighttraj.load",
+    ],
     "weighttraj": [FORMAT],
     "tipl.errors": ["weighttraj.errors"],
     "tipl.representation": ["tipl.errors"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -66,6 +67,8 @@ def test_every_block_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
             )
             assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     assert used == set(SHORTER)
+    assert names["weights"].shape == (49, 122)
+    assert names["second"]["weights"].shape == (4, 20, 122)
     assert names["batch"]["weights"].shape[1:] == (20, 122)
     assert (folder / "data/demo/report/report.html").exists()
 
@@ -88,6 +91,16 @@ def test_the_numbers_come_from_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert page.read_text() == README, (
         "run: tipl report datasets/demo/results.json --into README.md"
     )
+
+
+def test_the_benchmarks_come_from_the_file() -> None:
+    file = ROOT / "tests/benchmarks/results.py"
+    spec = importlib.util.spec_from_file_location("results", file)
+    assert spec is not None
+    assert spec.loader is not None
+    results = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(results)
+    assert results.insert(README) == README, f"run: python {file.relative_to(ROOT)}"
 
 
 def test_links_lead_somewhere() -> None:

@@ -161,6 +161,17 @@ def _import(
     print(wt.open(wt.import_hdf5(file, out)))
 
 
+@app.command(name="cache")
+def _cache(
+    clear: Annotated[bool, tyro.conf.arg(help="remove every decoded run")] = False,
+) -> None:
+    """Where decoded runs are kept for training, and how large that is."""
+    from weighttraj.load import cache_folder, cache_size, clear_cache
+
+    size = clear_cache() if clear else cache_size()
+    print(f"{cache_folder()}: {size / 1e6:.1f} MB{' removed' if clear else ''}")
+
+
 def _state_of(path: Path) -> str:
     """What remains to be said of something whole: it may not be finished."""
     if not (path / "dataset.json").is_file():

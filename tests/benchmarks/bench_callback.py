@@ -20,6 +20,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from results import save
+
 HOOKS = ("_on_training_start", "_on_rollout_end", "_on_gradient_step", "_on_training_end")
 
 
@@ -61,6 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=14)
     parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--save", action="store_true", help="keep the figures in results.json")
     parser.add_argument("--one", choices=["with", "without"], help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
@@ -73,23 +76,19 @@ def main() -> None:
             command += ["--iterations", str(args.iterations)]
             done = subprocess.run(command, capture_output=True, text=True, check=True)
             results.append(json.loads(done.stdout.splitlines()[-1]))
-    pairs = zip(runs["with"], runs["without"], strict=True)
+    pairs = list(zip(runs["with"], runs["without"], strict=True))
     shares = [r["cpu_s"] / (r["cpu_s"] - r["inside_s"]) for r in runs["with"]]
-    print(
-        json.dumps(
-            {
-                "iterations": args.iterations,
-                "ratio_in_turns": [round(a["cpu_s"] / b["cpu_s"], 4) for a, b in pairs],
-                "ratio_inside": round(statistics.median(shares), 4),
-                "extra_peak_mib": round(
-                    statistics.median(r["peak_rss_mib"] for r in runs["with"])
-                    - statistics.median(r["peak_rss_mib"] for r in runs["without"]),
-                    1,
-                ),
-                "block_mib": round(64 * 71_948 * 4 / 2**20, 1),
-            }
-        )
-    )
+    extra = [a["peak_rss_mib"] - b["peak_rss_mib"] for a, b in pairs]
+    result = {
+        "iterations": args.iterations,
+        "ratio_in_turns": [round(a["cpu_s"] / b["cpu_s"], 4) for a, b in pairs],
+        "ratio_inside": round(statistics.median(shares), 4),
+        "extra_peak_mib": round(statistics.median(extra), 1),
+        "block_mib": round(64 * 71_948 * 4 / 2**20, 1),
+    }
+    print(json.dumps(result))
+    if args.save:
+        save("callback", result)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import torch
+from results import save
 
 import weighttraj as wt
 from weighttraj.format import DatasetInfo, RunEntry
@@ -162,6 +164,7 @@ def measure_opening(run: wt.Run, n_runs: int = 50) -> dict[str, float]:
             )
             times.append([float(x) for x in done.stdout.split()])
     return {
+        "runs": n_runs,
         "objects": objects,
         "first_window_cold_s": times[0][0],
         "first_window_s": min(t[0] for t in times[1:]),
@@ -173,23 +176,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--save", action="store_true", help="keep the table in results.json")
     args = parser.parse_args()
-    results = {}
+    results: dict[str, Any] = {"runs": {}, "opening": {}}
     for path in args.runs:
         run = wt.open_run(path)
         env = run.info.env.id if run.info.env else run.id
-        results[env] = measure(run, args.turns)
+        results["runs"][env] = measure(run, args.turns)
         print(f"\n{env}: {len(run)} snapshots of {run.layout.size} parameters")
         print(f"{'':32} {'size/raw':>9} {'CPU ms':>9} {'MB/CPU s':>9}")
-        for name, row in results[env].items():
+        for name, row in results["runs"][env].items():
             print(
                 f"{name:32} {row['size_of_raw']:9.3f} {1e3 * row['cpu_s']:9.1f} "
                 f"{row['MB_per_cpu_s']:9.0f}"
             )
         if run.layout.size < 1000:
-            results[f"{env}, 50 runs"] = measure_opening(run)
-            print("50 runs:", results[f"{env}, 50 runs"])
+            results["opening"] = measure_opening(run)
+            print("a data set of 50 runs:", results["opening"])
     print(json.dumps(results))
+    if args.save:
+        save("format", results)
 
 
 if __name__ == "__main__":

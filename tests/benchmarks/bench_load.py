@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from results import save
 from torch.utils.data import DataLoader, Dataset
 
 import weighttraj as wt
@@ -36,6 +37,9 @@ BARE = {
     "loader, no workers": "bare, no workers",
 }
 """Each way to load, and what it is compared with."""
+
+KEPT = {"dataloader_over_memmap": "to_torch", "resumable_over_memmap": "loader"}
+"""Ratios that ``--save`` keeps."""
 
 TICK = os.sysconf("SC_CLK_TCK")
 
@@ -153,6 +157,7 @@ def measure(path: Path, args: argparse.Namespace) -> dict[str, Any]:
     given = epochs * per_epoch
     return {
         "run": path.name,
+        "env": run.info.env.id if run.info.env else run.id,
         "shape": list(rows.shape),
         "first_open_s": round(opened, 3),
         "batch_size": batch_size,
@@ -181,10 +186,14 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--turns", type=int, default=9)
     parser.add_argument("--bytes", type=float, default=4e9, help="in a turn, about")
+    parser.add_argument("--save", action="store_true", help="keep the ratios in results.json")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    kept: dict[str, dict[str, float]] = {key: {} for key in KEPT}
     for path in args.runs:
         result = measure(path, args)
+        for key, name in KEPT.items():
+            kept[key][result["env"]] = result[name]["wall_ratio"]
         print(json.dumps(result), flush=True)
         print(f"\n{result['run']} {result['shape']}: one core copies {result['copy_gb_s']} GB/s")
         print("| from | GB/s | GB per CPU s | throughput / bare | CPU: bare / this | of the copy |")
@@ -197,6 +206,8 @@ def main() -> None:
                 f"{r['cpu_ratio']} | {share:.2f} |"
             )
         print(flush=True)
+    if args.save:
+        save("load", kept)
 
 
 if __name__ == "__main__":

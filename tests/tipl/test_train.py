@@ -14,6 +14,7 @@ import weighttraj as wt
 from tipl import TIPL, Persistence, Reconstruction, TemporalSVD, TrainConfig, train
 from tipl.errors import ForecastError, ModelError, TrainError
 from weighttraj.errors import FormatError
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
 
 @pytest.fixture
@@ -106,9 +107,9 @@ def test_other_data_are_not_mixed(config: TrainConfig, tmp_path: Path) -> None:
     train(config)
     other = tmp_path / "dataset"
     shutil.copytree(config.data, other)
-    document = json.loads((other / "dataset.json").read_text())
-    document["runs"][2]["split"] = "train"
-    (other / "dataset.json").write_text(json.dumps(document))
+    info = read_dataset_info(other)
+    runs = [replace(run, split="train") if run.id == "seed0002" else run for run in info.runs]
+    write_dataset_info(other, replace(info, runs=tuple(runs)))
     with pytest.raises(TrainError, match="seed0002"):
         train(replace(config, data=other))
     moved = tmp_path / "moved"
@@ -140,9 +141,8 @@ def test_impossible_settings_leave_no_folder(
 
 def test_a_data_set_without_training_runs_is_refused(config: TrainConfig, tmp_path: Path) -> None:
     (tmp_path / "dataset").mkdir()
-    document = json.loads((config.data / "dataset.json").read_text())
-    document |= {"runs": [], "status": "collecting"}
-    (tmp_path / "dataset/dataset.json").write_text(json.dumps(document))
+    info = replace(read_dataset_info(config.data), runs=(), status="collecting")
+    write_dataset_info(tmp_path / "dataset", info)
     with pytest.raises(FormatError, match="no runs"):
         train(replace(config, data=tmp_path / "dataset"))
 

@@ -31,6 +31,9 @@ PACKED_CHUNK_BYTES = 4 << 20
 MAX_CHUNK_BYTES = 1 << 30
 """Decoded bytes in a chunk that a reader accepts: more could be there to fill the memory."""
 
+PLAIN = {"name": "bytes", "configuration": {"endian": "little"}}
+"""The codec of numbers as they are in memory."""
+
 KNOWN_CODECS = frozenset(
     {"bytes", "transpose", "blosc", "gzip", "zstd", "crc32c", "sharding_indexed"}
     | {"numcodecs.pcodec"}
@@ -131,6 +134,34 @@ def check_array(spec: ArraySpec, document: Any, rows: int, where: str) -> None:
             where=where,
             do="do not use data from a source that you do not trust",
         )
+
+
+def check_grid(document: dict[str, Any]) -> None:
+    """Raise ValueError, TypeError or KeyError if the chunks of an array cannot be counted."""
+    shape = document["shape"]
+    whole = all(type(n) is int and n >= 0 for n in shape)
+    chunk = document["chunk_grid"]["configuration"]["chunk_shape"]
+    if not whole or not _divides(chunk, [0] * len(shape)):
+        raise ValueError(f"shape {shape} in chunks of {chunk}")
+
+
+def unshard(
+    codecs: list[dict[str, Any]], outer: tuple[int, ...]
+) -> tuple[list[dict[str, Any]], tuple[int, ...], bool]:
+    """The codec chain of a chunk, its shape, and whether chunks lie in shards (index first).
+
+    Raises:
+        NotImplementedError: they lie in other shards than this package writes.
+    """
+    if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
+        return codecs, outer, False
+    shard = codecs[0]["configuration"]
+    if (
+        shard["index_codecs"] != [PLAIN, {"name": "crc32c"}]
+        or shard.get("index_location") != "start"
+    ):
+        raise NotImplementedError("sharding")
+    return shard["codecs"], tuple(shard["chunk_shape"]), True
 
 
 @contextmanager

@@ -16,10 +16,9 @@ import numpy as np
 from numcodecs import blosc
 
 from weighttraj.errors import DamageError, FormatError
-from weighttraj.format.objects import Objects
+from weighttraj.format.codecs import PLAIN, unshard
+from weighttraj.format.objects import Objects, missing_object
 
-_BYTES = {"name": "bytes", "configuration": {"endian": "little"}}
-_CRC = {"name": "crc32c"}
 _MISSING = 2**64 - 1
 
 
@@ -43,11 +42,11 @@ class RowDecoder:
         self._shape = tuple(document["shape"])
         self._dtype = np.dtype(document["data_type"]).newbyteorder("<")
         self._outer = tuple(document["chunk_grid"]["configuration"]["chunk_shape"])
-        codecs, self._chunk, self._sharded = _unshard(document["codecs"], self._outer)
+        codecs, self._chunk, self._sharded = unshard(document["codecs"], self._outer)
         self._transposed = bool(codecs) and codecs[0] == _transpose(len(self._shape))
         codecs = codecs[1:] if self._transposed else codecs
         single_byte = self._dtype.itemsize == 1
-        plain = codecs[:1] == [_BYTES] or (single_byte and codecs[:1] == [{"name": "bytes"}])
+        plain = codecs[:1] == [PLAIN] or (single_byte and codecs[:1] == [{"name": "bytes"}])
         kinds = [codec["name"] for codec in codecs]
         self._pco = kinds == ["numcodecs.pcodec", "crc32c"] and not self._transposed
         if not self._pco and not (plain and kinds[1:] == ["blosc", "crc32c"]):
@@ -158,13 +157,7 @@ class RowDecoder:
         return "/".join([self._name, "c", *map(str, index)])
 
     def _missing(self, index: tuple[int, ...]) -> DamageError:
-        return DamageError(
-            "committed data is missing",
-            expected=f"the object {self._key(index)}",
-            got="no such object",
-            where=self._objects.path,
-            do="restore the file from a copy, or collect the run again from its seed",
-        )
+        return missing_object(self._key(index), self._objects.path)
 
     def _damaged(self, index: tuple[int, ...], got: object) -> DamageError:
         return DamageError(
@@ -180,18 +173,6 @@ def grid(parts: list[range]) -> Iterator[tuple[int, ...]]:
     """As ``itertools.product``, which would make lists of the ranges first."""
     for i in parts[0]:
         yield from ((i, *rest) for rest in grid(parts[1:])) if parts[1:] else [(i,)]
-
-
-def _unshard(
-    codecs: list[dict[str, Any]], outer: tuple[int, ...]
-) -> tuple[list[dict[str, Any]], tuple[int, ...], bool]:
-    """The codec chain of a chunk, its shape, and whether chunks lie in shards (index first)."""
-    if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
-        return codecs, outer, False
-    shard = codecs[0]["configuration"]
-    if shard["index_codecs"] != [_BYTES, _CRC] or shard.get("index_location") != "start":
-        raise NotImplementedError("sharding")
-    return shard["codecs"], tuple(shard["chunk_shape"]), True
 
 
 def _transpose(ndim: int) -> dict[str, Any]:

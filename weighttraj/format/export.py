@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from weighttraj.errors import StoreExistsError, missing_extra
-from weighttraj.format.objects import sync
+from weighttraj.errors import missing_extra
+from weighttraj.format.objects import refuse_existing, sync
 from weighttraj.format.reader import Run, StoredArray
 from weighttraj.format.schema import to_json
 
@@ -33,7 +33,7 @@ def appearing(path: Path) -> Iterator[Path]:
     Raises:
         StoreExistsError: the path exists.
     """
-    _refuse(path)
+    refuse_existing(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
     _remove(draft)  # of a killed process with the same number
@@ -41,7 +41,7 @@ def appearing(path: Path) -> Iterator[Path]:
         yield draft
         for file in (draft, *draft.rglob("*")):
             sync(file)
-        _refuse(path)
+        refuse_existing(path)
         draft.rename(path)
         sync(path.parent)
     finally:
@@ -158,17 +158,6 @@ def _write_csv(file: Path, header: Iterable[str], lines: Iterable[Iterable[Any]]
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(lines)
-
-
-def _refuse(path: Path) -> None:
-    if path.exists():
-        raise StoreExistsError(
-            "the path to be written exists",
-            expected="a new path",
-            got="a folder" if path.is_dir() else "a file",
-            where=path,
-            do="choose another path, or delete it",
-        )
 
 
 def _remove(draft: Path) -> None:

@@ -223,6 +223,16 @@ def _chunk_keys(store: RunStore, name: str) -> Iterator[str]:
         yield "/".join([name, "c", *map(str, index)])
 
 
+def _is_chunk(store: RunStore, name: str) -> bool:
+    """Whether an object is a chunk of committed rows."""
+    array, _, index = name.rpartition("/c/")
+    if array not in store.documents or re.fullmatch(r"\d{1,18}(/\d{1,18})*", index) is None:
+        return False
+    place, grid = [int(i) for i in index.split("/")], _grid(store, array)
+    plain = "/".join(map(str, place)) == index and len(place) == len(grid)
+    return plain and all(i < n for i, n in zip(place, grid, strict=True))
+
+
 def _names(store: RunStore) -> Iterator[str]:
     if isinstance(store.objects, ZipObjects):
         yield from store.objects.names
@@ -292,9 +302,8 @@ def _repair_run(path: Path, cut: bool) -> list[str]:
 def _sweep(store: LiveStore) -> None:
     """Remove files that belong to nothing that was committed."""
     documents = member_documents(store.documents)
-    chunks = {key for name in store.documents for key in _chunk_keys(store, name)}
     for name in _names(store):
-        if name not in chunks and name not in documents and name != "zarr.json":
+        if not _is_chunk(store, name) and name not in documents and name != "zarr.json":
             (store.path / name).unlink()
     for draft in store.path.parent.glob(f".{store.path.name}.*"):
         if _DRAFT.fullmatch(draft.name):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,10 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from weighttraj.errors import DamageError, FormatError, StoreExistsError
+from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.codecs import create_array
-from weighttraj.format.objects import FolderObjects, replace_file, sync
+from weighttraj.format.encode import ObjectEncoder
+from weighttraj.format.objects import FolderObjects, refuse_existing, replace_file, sync
 from weighttraj.format.schema import RunInfo, arrays_of
 from weighttraj.format.storage import (
     PACKED,
@@ -40,6 +43,7 @@ class LiveStore(RunStore):
         super().__init__(objects, info, documents)
         self._unsynced: set[Path] = set()
         self._writable: dict[str, zarr.Array[Any]] = {}
+        self._encoders: dict[str, ObjectEncoder | None] = {}
 
     @classmethod
     def create(
@@ -55,14 +59,7 @@ class LiveStore(RunStore):
         Raises:
             StoreExistsError: the path exists.
         """
-        if path.exists():
-            raise StoreExistsError(
-                "the path to be written exists",
-                expected="a new path",
-                got="a folder" if path.is_dir() else "a file",
-                where=path,
-                do="choose another path, delete it, or continue the run with resume=True",
-            )
+        refuse_existing(path, "choose another path, delete it, or continue with resume=True")
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
         shutil.rmtree(draft, ignore_errors=True)
@@ -94,7 +91,7 @@ class LiveStore(RunStore):
         store.write_members()
         return store
 
-    def write(self, name: str, start: int, values: np.ndarray) -> None:
+    def write(self, name: str, start: int, rows: Sequence[np.ndarray] | np.ndarray) -> None:
         """Write rows of an array from ``start`` on, which begins a chunk; nothing is committed.
 
         Every chunk is written whole and replaced atomically, then read back and compared.
@@ -102,6 +99,32 @@ class LiveStore(RunStore):
         Raises:
             DamageError: what was read back is not what was written.
         """
+        encoder, size = self._encoder(name), self.chunk_rows(name)
+        if encoder is None:
+            self._write_by_zarr(name, start, np.asarray(rows))
+        else:
+            inner = ["0"] * len(self.specs[name].inner)
+            for first in range(0, len(rows), size):
+                key = "/".join([name, "c", str((start + first) // size), *inner])
+                encoder.write(self.path / key, rows[first : first + size])
+        self._unsynced |= self._files(name, start, start + len(rows))
+
+    def _encoder(self, name: str) -> ObjectEncoder | None:
+        if name not in self._encoders:
+            encoder = None
+            # One object must span the columns; packed runs have several.
+            if self._one_object_wide(name):
+                with contextlib.suppress(NotImplementedError):
+                    encoder = ObjectEncoder(self.specs[name], self.documents[name])
+            self._encoders[name] = encoder
+        return self._encoders[name]
+
+    def _one_object_wide(self, name: str) -> bool:
+        document = self.documents[name]
+        widths = document["chunk_grid"]["configuration"]["chunk_shape"][1:]
+        return all(w >= n for w, n in zip(widths, document["shape"][1:], strict=True))
+
+    def _write_by_zarr(self, name: str, start: int, values: np.ndarray) -> None:
         if name not in self._writable:
             store = _BlockStore(self.path, name, self.documents[name])
             self._writable[name] = open_array(store, name, "r+", str(self.path))
@@ -117,7 +140,6 @@ class LiveStore(RunStore):
         elif array.shape[0] < stop:
             array.resize((stop, *array.shape[1:]))
         array[rows] = values
-        self._unsynced |= self._files(name, start, stop)
         if np.asarray(array[rows]).tobytes() != values.tobytes():
             raise DamageError(
                 "what was written reads back as something else",
@@ -169,7 +191,7 @@ class LiveStore(RunStore):
         return {*files, *parents}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_writable": {}}
+        return {**super().__getstate__(), "_writable": {}, "_encoders": {}}
 
 
 class _BlockStore(LocalStore):

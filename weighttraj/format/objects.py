@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from weighttraj.errors import DamageError, FormatError
+from weighttraj.errors import DamageError, FormatError, StoreExistsError
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
@@ -183,6 +183,33 @@ def check_name(name: str, where: object) -> str:
             do="do not use data from a source that you do not trust",
         )
     return name
+
+
+def refuse_existing(path: Path, do: str = "choose another path, or delete it") -> None:
+    """Nothing is overwritten.
+
+    Raises:
+        StoreExistsError: the path exists.
+    """
+    if path.exists():
+        raise StoreExistsError(
+            "the path to be written exists",
+            expected="a new path",
+            got="a folder" if path.is_dir() else "a file",
+            where=path,
+            do=do,
+        )
+
+
+def missing_object(name: str, where: object) -> DamageError:
+    """The error for an object that was committed and is not there."""
+    return DamageError(
+        "committed data is missing",
+        expected=f"the object {name}",
+        got="no such object",
+        where=where,
+        do="restore the file from a copy, or collect the run again from its seed",
+    )
 
 
 def write_zip(path: Path, members: Iterable[tuple[str, Path]]) -> None:

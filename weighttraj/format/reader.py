@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.catalog import read_dataset_info
 from weighttraj.format.layout import ParamLayout
+from weighttraj.format.objects import FolderObjects
 from weighttraj.format.schema import ArraySpec, DatasetInfo, RunEntry, RunInfo
 from weighttraj.format.storage import RunStore
 
@@ -358,7 +359,7 @@ def open_dataset(path: str | Path) -> Dataset:
 
     Raises:
         FileNotFoundError: there is no data set at the path.
-        FormatError: it is none of this format.
+        FormatError: it is none of this format, or a run is a link.
         DamageError: it is complete but lacks a run that it lists.
     """
     path = Path(path)
@@ -367,8 +368,9 @@ def open_dataset(path: str | Path) -> Dataset:
 
         return open_hdf5(path)
     info = read_dataset_info(path)
-    runs = []
+    runs, objects = [], FolderObjects(path)
     for entry in info.runs:
+        objects.file(entry.path)  # refuses links: they could lead anywhere
         place = path / entry.path
         if place.is_file() or (place / "zarr.json").is_file():
             runs.append(Run(place, partial(RunStore.open, place), entry))

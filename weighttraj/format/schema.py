@@ -27,6 +27,7 @@ AXES: tuple[Axis, ...] = ("time", "iteration")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _MAX_ROW = 2**31  # elements; beyond it a snapshot is taken for damaged metadata
 _MAX_COUNT = 2**48
+_MAX_DEPTH = 64  # of JSON; what walks it may call itself so often
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,8 +184,8 @@ class RunInfo:
 
     def __post_init__(self) -> None:
         check_id(self.run_id, "run id")
-        counts = (self.block - 1, self.n_committed, self.n_committed_iterations)
-        counts = (*counts, self.probe_observations)
+        rows = (self.n_committed, self.n_committed_iterations)
+        counts = (self.block - 1, *rows, self.probe_observations)
         if min(counts) < 0 or max(counts) > _MAX_COUNT or self.layout.size > _MAX_ROW:
             raise FormatError(
                 "a count in the metadata is out of range",
@@ -362,6 +363,8 @@ def load_json(text: bytes, where: object) -> Any:
         value = json.loads(text.decode(), object_pairs_hook=_no_key_twice)
         # NaN, infinite numbers and lone surrogates are Python's, not JSON's.
         json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+        if _is_deep([value]):
+            raise ValueError(f"more than {_MAX_DEPTH} values in one another")
         return value
     except (ValueError, RecursionError) as error:
         raise FormatError(
@@ -370,6 +373,16 @@ def load_json(text: bytes, where: object) -> Any:
             where=where,
             do="restore the file from a copy; the arrays beside it may be whole",
         ) from error
+
+
+def _is_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(_MAX_DEPTH):
+        inner = [v.values() if isinstance(v, dict) else v for v in level]
+        level = [v for values in inner for v in values if isinstance(v, dict | list)]
+        if not level:
+            return False
+    return True
 
 
 def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

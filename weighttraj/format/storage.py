@@ -19,9 +19,15 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from weighttraj.errors import DamageError, FormatError, MissingExtraError
-from weighttraj.format.codecs import check_array, quiet_codecs
+from weighttraj.format.codecs import check_array, check_grid, quiet_codecs
 from weighttraj.format.decode import RowDecoder
-from weighttraj.format.objects import FolderObjects, Objects, ZipObjects, check_name
+from weighttraj.format.objects import (
+    FolderObjects,
+    Objects,
+    ZipObjects,
+    check_name,
+    missing_object,
+)
 from weighttraj.format.schema import RunInfo, arrays_of, load_json, parse, to_json
 
 # Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
@@ -128,7 +134,7 @@ class RunStore:
             index[axis] = chunk
             key = "/".join([name, "c", *map(str, index)])
             if not self.objects.exists(key):
-                raise _missing(key, self.path)
+                raise missing_object(key, self.path)
 
     def _by_column(self, name: str) -> bool:
         """Whether rows are the last axis of an array, as in the archive profile."""
@@ -183,7 +189,7 @@ class _CommittedStore(MemoryStore):
             start = -byte_range.suffix
         value = self._objects.read(key, start, stop)
         if value is None:
-            raise _missing(key, self._objects.path)
+            raise missing_object(key, self._objects.path)
         return (prototype or default_buffer_prototype()).buffer.from_bytes(value)
 
 
@@ -248,7 +254,9 @@ def _array_documents(document: dict[str, Any], where: str) -> Documents:
     try:
         nodes = document["consolidated_metadata"]["metadata"]
         arrays = {name: node for name, node in nodes.items() if node["node_type"] == "array"}
-    except (KeyError, TypeError, AttributeError) as error:
+        for node in arrays.values():
+            check_grid(node)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise FormatError(
             "the run's metadata lack those of its arrays",
             expected="Zarr's consolidated metadata",
@@ -298,16 +306,6 @@ def checksum(metadata: Any) -> str:
     """SHA-256 of metadata as JSON with sorted keys and no spaces."""
     text = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _missing(key: str, where: object) -> DamageError:
-    return DamageError(
-        "committed data is missing",
-        expected=f"the object {key}",
-        got="no such object",
-        where=where,
-        do="restore the file from a copy, or collect the run again from its seed",
-    )
 
 
 def open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:

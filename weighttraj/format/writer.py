@@ -148,8 +148,7 @@ class RunWriter:
         store = self._store
         for axis, block in self._blocks.items():
             for spec in self._specs(axis) if block.rows else []:
-                values = np.stack([row[spec.name] for row in block.rows])
-                store.write(spec.name, block.first, values)
+                store.write(spec.name, block.first, [row[spec.name] for row in block.rows])
         time, iteration = (self._blocks[a].first + len(self._blocks[a].rows) for a in AXES)
         store.commit(with_progress(store.info, status=status, time=time, iteration=iteration))
         for axis, block in self._blocks.items():

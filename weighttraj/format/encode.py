@@ -1,0 +1,107 @@
+"""Encodes one object of an array, chunk by chunk, without Zarr's machinery and its copies.
+
+The counterpart of ``decode``, for runs that are being collected: what Zarr holds at once is ten
+times a block, and training goes on beside it. Zarr reads what is written here; tests see to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+from numcodecs import blosc
+
+from weighttraj.errors import DamageError
+from weighttraj.format.codecs import unshard
+from weighttraj.format.schema import ArraySpec
+
+_SHUFFLES = {"noshuffle": blosc.NOSHUFFLE, "shuffle": blosc.SHUFFLE, "bitshuffle": blosc.BITSHUFFLE}
+
+
+class ObjectEncoder:
+    """Encodes blocks of rows of one array.
+
+    Args:
+        spec: the array.
+        document: its Zarr metadata.
+
+    Raises:
+        NotImplementedError: Zarr must write this array.
+    """
+
+    def __init__(self, spec: ArraySpec, document: dict[str, Any]) -> None:
+        self._spec = spec
+        outer = tuple(document["chunk_grid"]["configuration"]["chunk_shape"])
+        codecs, self._chunk, self._sharded = unshard(document["codecs"], outer)
+        kinds = [codec["name"] for codec in codecs]
+        transposed = document["dimension_names"][0] != spec.axis
+        if kinds != ["bytes", "blosc", "crc32c"] or transposed or len(spec.inner) > 2:
+            raise NotImplementedError(kinds)
+        self._blosc = codecs[1]["configuration"]
+        self._counts = tuple(o // c for o, c in zip(outer, self._chunk, strict=True))
+
+    def write(self, path: Path, rows: Sequence[np.ndarray] | np.ndarray) -> None:
+        """Write one object so that readers see all of it or none; read it back and compare.
+
+        Fewer rows than a chunk has are filled up. One chunk at a time is in memory.
+
+        Raises:
+            DamageError: a chunk does not decode to what was encoded, or reads back differently.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_name(f".{path.name}.draft")
+        starts = [i * self._chunk[1] for i in range(self._counts[1])] if self._sharded else [0]
+        head = 16 * len(starts) + 4 if self._sharded else 0
+        table: list[tuple[int, int]] = []
+        checks: list[int] = []
+        with draft.open("wb") as file:
+            file.seek(head)
+            for start in starts:
+                data = self._encode(rows, start)
+                table.append((file.tell(), len(data)))
+                checks.append(google_crc32c.value(data))
+                file.write(data)
+            if self._sharded:
+                index = np.array(table, "<u8").tobytes()
+                file.seek(0)
+                file.write(index + _crc(index))
+        draft.replace(path)
+        with path.open("rb") as file:
+            same = not self._sharded or file.read(head) == index + _crc(index)
+            got = [google_crc32c.value(file.read(length)) for _, length in table]
+            if not same or got != checks or file.read(1):
+                raise DamageError(
+                    "what was written reads back as something else",
+                    where=path,
+                    do="check the disk; nothing of this block was committed",
+                )
+
+    def _encode(self, rows: Sequence[np.ndarray] | np.ndarray, column: int) -> bytes:
+        chunk = np.full(self._chunk, self._spec.fill, self._spec.dtype)
+        if len(self._chunk) == 2:
+            width = min(self._chunk[1], self._spec.inner[0] - column)
+            for target, row in zip(chunk, rows, strict=False):
+                target[:width] = row[column : column + width]
+        else:
+            chunk[: len(rows)] = np.stack(list(rows))
+        settings = self._blosc
+        shuffle = _SHUFFLES[settings["shuffle"]]
+        data: bytes = blosc.compress(
+            chunk, settings["cname"].encode(), settings["clevel"], shuffle, settings["blocksize"]
+        )
+        again = np.empty_like(chunk)
+        blosc.decompress(data, again)
+        if not np.array_equal(again.view(np.uint8), chunk.view(np.uint8)):
+            raise DamageError(
+                "a chunk decodes to something else than was encoded",
+                where=f"array {self._spec.name!r}",
+                do="check the memory of this machine; nothing of this block was committed",
+            )
+        return data + _crc(data)
+
+
+def _crc(data: bytes) -> bytes:
+    return int(google_crc32c.value(data)).to_bytes(4, "little")
