@@ -108,7 +108,9 @@ class StoredArray:
     def _check(self, index: Any, values: np.ndarray) -> None:
         expected = np.atleast_2d(self._store.read("digest", index))
         rows = np.ascontiguousarray(np.atleast_2d(values), "<f4")
-        got = b"".join([hashlib.sha256(row).digest() for row in rows])
+        size, content = rows.shape[1] * rows.itemsize, memoryview(rows).cast("B")
+        starts = range(0, len(content), size)
+        got = b"".join([hashlib.sha256(content[i : i + size]).digest() for i in starts])
         if got == expected.tobytes():
             return
         bad = int(np.flatnonzero(np.frombuffer(got, np.uint8) != expected.reshape(-1))[0]) // 32
