@@ -108,7 +108,7 @@ class StoredArray:
     def _check(self, index: Any, values: np.ndarray) -> None:
         expected = np.atleast_2d(self._store.read("digest", index))
         rows = np.ascontiguousarray(np.atleast_2d(values), "<f4")
-        size, content = rows.shape[1] * rows.itemsize, memoryview(rows).cast("B")
+        size, content = rows.shape[1] * rows.itemsize, rows.reshape(-1).view(np.uint8).data
         starts = range(0, len(content), size)
         got = b"".join([hashlib.sha256(content[i : i + size]).digest() for i in starts])
         if got == expected.tobytes():
