@@ -126,12 +126,10 @@ def make_samples(dataset: Path, folder: Path) -> None:
         lock.unlink()
 
 
-def live_copy(
-    run: wt.Run, path: Path, n: int, iterations: int, status: Any, profile: Any = "default"
-) -> None:
+def live_copy(run: wt.Run, path: Path, n: int, iterations: int, status: Any) -> None:
     """The first rows of a run, as they lay while it was collected."""
     counts = {"time": n, "iteration": iterations}
-    empty = replace(run.info, n_committed=0, n_committed_iterations=0, profile=profile)
+    empty = replace(run.info, n_committed=0, n_committed_iterations=0, profile="default")
     store = LiveStore.create(path, empty)
     for spec in store.specs.values():
         rows = run[spec.name][: counts[spec.axis]]
@@ -150,7 +148,7 @@ def contents(path: Path) -> dict[str, Any]:
 
 def run_contents(run: wt.Run) -> dict[str, Any]:
     found: dict[str, Any] = {name: array[:].tobytes() for name, array in run.arrays.items()}
-    # Columns and single rows take another way, through Zarr.
+    # Columns and single rows take another way.
     found["columns"] = run.weights[:, 1:3].tobytes()
     found["row"] = run["index/num_timesteps"][len(run) - 1].tobytes()
     return found | {"info": run.info}

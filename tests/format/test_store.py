@@ -33,6 +33,7 @@ from weighttraj.errors import (
 )
 from weighttraj.format import ObsNorm, ParamLayout, PolicySpec, RunInfo, RunWriter
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.format.live import LiveStore
 
 LAYOUT = ParamLayout.of({"w": ((3, 4), "weight", ("hidden_0", "observation"))})
 MASK = np.arange(20) % 3 == 1
@@ -450,11 +451,30 @@ def test_missing_and_truncated_chunks_are_found(run: wt.Run, damage: str) -> Non
 
 
 def test_rewritten_weights_do_not_match_their_digest(run: wt.Run) -> None:
-    array = zarr.open_array(LocalStore(run.path), path="policy/weights", mode="r+")
-    array[5, 5] = 42.0
+    other = weights(8)
+    other[5, 5] = 42.0
+    store = LiveStore.open(run.path)
+    store.write("policy/weights", 0, other)
+    store.commit(run.info)
     with pytest.raises(DamageError, match="digest"):
         wt.open_run(run.path).weights[5]
     assert "digest" in wt.verify(run.path)[0]
+
+
+def test_weights_rewritten_by_zarr_are_not_what_was_committed(run: wt.Run) -> None:
+    array = zarr.open_array(LocalStore(run.path), path="policy/weights", mode="r+")
+    array[5, 5] = 42.0
+    with pytest.raises(DamageError, match="another chunk"):
+        wt.open_run(run.path).weights[5]
+
+
+def test_a_chunk_in_the_place_of_another_is_found(run: wt.Run) -> None:
+    first, second, _ = chunk_files(run, "index/num_timesteps")
+    second.write_bytes(first.read_bytes())
+    assert np.array_equal(wt.open_run(run.path)["index/num_timesteps"][:8], 10 * np.arange(8))
+    with pytest.raises(DamageError, match="another chunk"):
+        wt.open_run(run.path)["index/num_timesteps"][:]
+    assert "another chunk" in wt.verify(run.path)[0]
 
 
 def test_damaged_metadata_is_found(run: wt.Run) -> None:

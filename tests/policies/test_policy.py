@@ -111,7 +111,7 @@ def test_files_that_a_run_names_are_not_opened(full_run: wt.Run) -> None:
             return replace(info, env=env)
 
     with pytest.raises(PolicyError, match=r"/etc/model\.xml"):
-        evaluate(full_run.load_policy(0), Elsewhere(full_run.path))
+        evaluate(full_run.load_policy(0), Elsewhere(full_run.path, full_run._opener))
 
 
 def test_a_run_without_environment_cannot_be_evaluated(full_run: wt.Run) -> None:
@@ -121,4 +121,4 @@ def test_a_run_without_environment_cannot_be_evaluated(full_run: wt.Run) -> None
             return replace(super().info, env=None)
 
     with pytest.raises(PolicyError, match="which environment"):
-        evaluate(full_run.load_policy(0), Nowhere(full_run.path))
+        evaluate(full_run.load_policy(0), Nowhere(full_run.path, full_run._opener))

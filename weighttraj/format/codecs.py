@@ -35,8 +35,7 @@ PLAIN = {"name": "bytes", "configuration": {"endian": "little"}}
 """The codec of numbers as they are in memory."""
 
 KNOWN_CODECS = frozenset(
-    {"bytes", "transpose", "blosc", "gzip", "zstd", "crc32c", "sharding_indexed"}
-    | {"numcodecs.pcodec"}
+    {"bytes", "transpose", "blosc", "crc32c", "sharding_indexed"} | {"numcodecs.pcodec"}
 )
 """Codecs that a reader accepts."""
 
@@ -54,6 +53,8 @@ def create_array(
         block: rows of a chunk while the run is collected.
         packed_rows: rows the array will have in a packed run; None: the run is being collected.
     """
+    if packed_rows is None:
+        profile = "default"  # until the run is packed
     by_column = profile == "archive" and len(spec.inner) == 1 and spec.dtype != "uint8"
     if packed_rows is None:
         rows, columns = block, spec.inner
@@ -151,7 +152,7 @@ def unshard(
     """The codec chain of a chunk, its shape, and whether chunks lie in shards (index first).
 
     Raises:
-        NotImplementedError: they lie in other shards than this package writes.
+        FormatError: they lie in other shards than the format has.
     """
     if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
         return codecs, outer, False
@@ -160,7 +161,12 @@ def unshard(
         shard["index_codecs"] != [PLAIN, {"name": "crc32c"}]
         or shard.get("index_location") != "start"
     ):
-        raise NotImplementedError("sharding")
+        raise FormatError(
+            "refused: chunks lie in shards that this format does not have",
+            expected="the index first, its codecs bytes and crc32c",
+            got=shard,
+            do="do not use data from a source that you do not trust",
+        )
     return shard["codecs"], tuple(shard["chunk_shape"]), True
 
 

@@ -17,21 +17,24 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from weighttraj.errors import DamageError, FormatError
-from weighttraj.format.codecs import create_array
+from weighttraj.errors import DamageError, FormatError, MissingExtraError
+from weighttraj.format.codecs import create_array, quiet_codecs
 from weighttraj.format.encode import ObjectEncoder
 from weighttraj.format.objects import FolderObjects, refuse_existing, replace_file, sync
 from weighttraj.format.schema import RunInfo, arrays_of
 from weighttraj.format.storage import (
     PACKED,
-    Documents,
+    Metadata,
     RunStore,
     array_document,
+    chunk_count,
     group_document,
     member_documents,
-    open_array,
     read_metadata,
 )
+
+# Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
+_EMPTY_CHUNKS = {"array.write_empty_chunks": True}
 
 
 class LiveStore(RunStore):
@@ -39,8 +42,8 @@ class LiveStore(RunStore):
 
     objects: FolderObjects
 
-    def __init__(self, objects: FolderObjects, info: RunInfo, documents: Documents) -> None:
-        super().__init__(objects, info, documents)
+    def __init__(self, objects: FolderObjects, metadata: Metadata) -> None:
+        super().__init__(objects, metadata)
         self._unsynced: set[Path] = set()
         self._writable: dict[str, zarr.Array[Any]] = {}
         self._encoders: dict[str, ObjectEncoder | None] = {}
@@ -69,7 +72,8 @@ class LiveStore(RunStore):
             rows = packed_rows[spec.axis] if packed_rows else None
             create_array(group, spec, info.profile, info.block, rows)
             documents[name] = json.loads((draft / name / "zarr.json").read_bytes())
-        store = cls(FolderObjects(draft), info, documents)
+        tags = dict.fromkeys(documents, "")
+        store = cls(FolderObjects(draft), Metadata(info=info, documents=documents, tags=tags))
         store.commit(info)
         draft.rename(path)
         sync(path.parent)
@@ -87,7 +91,7 @@ class LiveStore(RunStore):
         if path.name.endswith(PACKED):
             raise FormatError("a packed run is finished; nothing can be added", where=path)
         objects = FolderObjects(path)
-        store = cls(objects, *read_metadata(objects))
+        store = cls(objects, read_metadata(objects))
         store.write_members()
         return store
 
@@ -102,12 +106,30 @@ class LiveStore(RunStore):
         encoder, size = self._encoder(name), self.chunk_rows(name)
         if encoder is None:
             self._write_by_zarr(name, start, np.asarray(rows))
-        else:
-            inner = ["0"] * len(self.specs[name].inner)
-            for first in range(0, len(rows), size):
-                key = "/".join([name, "c", str((start + first) // size), *inner])
-                encoder.write(self.path / key, rows[first : first + size])
+        for first in range(start, start + len(rows), size):
+            if encoder is None:
+                tags = self._tags_on_disk(name, first // size)
+            else:
+                path = self.path / self._key(name, first // size)
+                tags = encoder.write(path, rows[first - start : first - start + size])
+            place = first // size * len(tags)
+            self.tags[name] = self.tags[name][:place] + tags + self.tags[name][place + len(tags) :]
         self._unsynced |= self._files(name, start, start + len(rows))
+
+    def _key(self, name: str, chunk: int, others: tuple[int, ...] = ()) -> str:
+        """The object of some rows of an array; others: its place along the other axes."""
+        index = [chunk, *(others or (0,) * len(self.specs[name].inner))]
+        index = index[1:] + index[:1] if self._by_column(name) else index
+        return "/".join([name, "c", *map(str, index)])
+
+    def _tags_on_disk(self, name: str, chunk: int) -> str:
+        """The crc32c that ends each chunk of some rows, which lie in objects of their own."""
+        document = self.documents[name]
+        sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
+        counts = [-(-n // c) for n, c in zip(document["shape"], sizes, strict=True)]
+        others = counts[:-1] if self._by_column(name) else counts[1:]
+        keys = [self._key(name, chunk, place) for place in np.ndindex(*others)]
+        return "".join([(self.objects.read(key, -4) or b"").hex() for key in keys])
 
     def _encoder(self, name: str) -> ObjectEncoder | None:
         if name not in self._encoders:
@@ -127,7 +149,7 @@ class LiveStore(RunStore):
     def _write_by_zarr(self, name: str, start: int, values: np.ndarray) -> None:
         if name not in self._writable:
             store = _BlockStore(self.path, name, self.documents[name])
-            self._writable[name] = open_array(store, name, "r+", str(self.path))
+            self._writable[name] = _open_array(store, name, "r+", str(self.path))
         array = self._writable[name]
         stop = start + len(values)
         values = np.ascontiguousarray(values, array.dtype)
@@ -159,9 +181,10 @@ class LiveStore(RunStore):
         for name, spec in self.specs.items():
             axis = documents[name]["dimension_names"].index(spec.axis)
             documents[name]["shape"][axis] = info.committed(spec.axis)
-        replace_file(self.path / "zarr.json", group_document(info, documents))
-        self.info, self.documents = info, documents
-        self._readable.clear()
+        tags = {n: self.tags[n][: 8 * chunk_count(documents[n])] for n in self.specs}
+        tags |= {name: tag for name, tag in self.tags.items() if name not in self.specs}
+        replace_file(self.path / "zarr.json", group_document(info, documents, tags))
+        self.info, self.documents, self.tags = info, documents, tags
         self._decoders.clear()
         self.write_members()
 
@@ -217,3 +240,28 @@ class _BlockStore(LocalStore):
         else:
             FolderObjects(self.root).file(key)  # no link that leads elsewhere
             await super().set(key, value)
+
+
+def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:
+    """Open an array by Zarr.
+
+    Raises:
+        DamageError: its metadata cannot be parsed.
+        MissingExtraError: its codec is not installed.
+    """
+    try:
+        with zarr.config.set(_EMPTY_CHUNKS), quiet_codecs():
+            return zarr.open_array(store, path=name, mode=mode, zarr_format=3)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"the archive profile needs {error.name}, which is not installed",
+            where=where,
+            do="pip install 'numcodecs[pcodec]'",
+        ) from error
+    except Exception as error:  # Zarr has no error of its own for metadata it cannot parse
+        raise DamageError(
+            "the metadata of an array is damaged",
+            got=repr(error),
+            where=f"{where}, array {name!r}",
+            do="restore the run from a copy",
+        ) from error

@@ -4,37 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
-from zarr.abc.store import (
-    ByteRequest,
-    OffsetByteRequest,
-    RangeByteRequest,
-    SuffixByteRequest,
-)
-from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
-from zarr.storage import MemoryStore
 
-from weighttraj.errors import DamageError, FormatError, MissingExtraError
-from weighttraj.format.codecs import check_array, check_grid, quiet_codecs
+from weighttraj.errors import DamageError, FormatError
+from weighttraj.format.codecs import check_array, check_grid, unshard
 from weighttraj.format.decode import RowDecoder
 from weighttraj.format.objects import (
     FolderObjects,
     Objects,
     ZipObjects,
     check_name,
-    missing_object,
 )
 from weighttraj.format.schema import RunInfo, arrays_of, load_json, parse, to_json
 
-# Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
-_EMPTY_CHUNKS = {"array.write_empty_chunks": True}
-
 ATTRIBUTE = "weighttraj"
 """Key of the run's metadata in the attributes of its Zarr group."""
+
+TAGS = "weighttraj_crc32c"
+"""Key of the checksums of all chunks: a chunk in the place of another is damage too."""
 
 CHECKSUM = "weighttraj_sha256"
 """Key of the checksum of the group's metadata."""
@@ -46,16 +38,28 @@ Documents = dict[str, dict[str, Any]]
 """Zarr metadata of each array, by name."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Metadata:
+    """What ``zarr.json`` of a run's group says."""
+
+    info: RunInfo
+    """The run."""
+    documents: Documents
+    """Zarr metadata of each array."""
+    tags: dict[str, str]
+    """The crc32c of each chunk of each array: 8 digits a chunk, row by row of chunks."""
+
+
 class RunStore:
     """The arrays and metadata of one run, to be read; in a folder or in one zip file."""
 
-    def __init__(self, objects: Objects, info: RunInfo, documents: Documents) -> None:
+    def __init__(self, objects: Objects, metadata: Metadata) -> None:
         self.objects = objects
-        self.info = info
-        self.specs = arrays_of(info)
-        self.documents = documents
-        self._readable: dict[str, zarr.Array[Any]] = {}
-        self._decoders: dict[str, RowDecoder | None] = {}
+        self.info = metadata.info
+        self.specs = arrays_of(metadata.info)
+        self.documents = metadata.documents
+        self.tags = metadata.tags
+        self._decoders: dict[str, RowDecoder] = {}
 
     @property
     def path(self) -> Path:
@@ -71,126 +75,66 @@ class RunStore:
             FormatError: it is no run of this format.
         """
         objects = objects_at(path)
-        return cls(objects, *read_metadata(objects))
+        return cls(objects, read_metadata(objects))
 
     def read(self, name: str, key: Any) -> np.ndarray:
-        """Read part of an array; ``key`` as numpy takes it, within the committed rows.
+        """Read part of an array, each axis selected on its own.
+
+        Args:
+            name: the array.
+            key: rows as a slice with a positive step, a number or numbers, within the committed
+                ones; after a comma, columns as numpy takes them.
 
         Raises:
-            DamageError: a chunk is missing, or its checksum is wrong.
+            DamageError: a chunk is missing, another one's, or its checksum is wrong.
+            FormatError: the array is encoded in a way that the format does not have.
         """
-        decoder = self._decoder(name)
-        if decoder is not None and isinstance(key, int):
-            return np.asarray(decoder.read(key, key + 1)[0])
-        if decoder is not None and isinstance(key, slice) and key.step in (None, 1):
-            start, stop, _ = key.indices(self.info.committed(self.specs[name].axis))
-            return decoder.read(start, max(start, stop))
-        array = self._array(name)
-        key = key if isinstance(key, tuple) else (key,)
-        by_column = self._by_column(name)
-        self._require(name, array, key[0], axis=1 if by_column else 0)
-        if by_column:
-            key = (key[1] if len(key) > 1 else slice(None), key[0])
-        where = f"{self.path}, array {name!r}, selection {key!r}"
-        basic = all(isinstance(part, int | slice) for part in key)
-        try:
-            values = np.asarray(array[key] if basic else array.oindex[key])
-        except FormatError:
-            raise
-        except MemoryError as error:
-            raise FormatError(
-                "this selection does not fit into memory",
-                got=error,
-                where=where,
-                do="read fewer rows at a time",
-            ) from error
-        # Codecs raise what they like; pco's errors are bare RuntimeErrors.
-        except Exception as error:
-            raise DamageError(
-                "committed data cannot be decoded",
-                expected="chunks whose crc32c matches",
-                got=error,
-                where=where,
-                do="restore the array's files from a copy, or collect the run again",
-            ) from error
-        return np.ascontiguousarray(values.T) if by_column else values
+        rows, *rest = key if isinstance(key, tuple) else (key,)
+        decoder, inner = self._decoder(name), self.specs[name].inner
+        columns, others = _columns(rest, inner)
+        if isinstance(rows, slice):
+            start, stop, step = rows.indices(self.info.committed(self.specs[name].axis))
+            values = decoder.read(start, max(start, stop), columns)[::step]
+        else:
+            values = self._scattered(name, np.atleast_1d(rows), columns)
+        values = values[(slice(None), *others)] if others else values
+        return values if isinstance(rows, slice) or np.ndim(rows) else np.asarray(values[0])
+
+    def _scattered(
+        self, name: str, rows: np.ndarray, columns: tuple[int, int] | None
+    ) -> np.ndarray:
+        """Rows in any order, read chunk by chunk."""
+        decoder, chunk = self._decoder(name), np.asarray(rows) // self.chunk_rows(name)
+        empty = decoder.read(0, 0, columns)
+        values = np.empty((len(rows), *empty.shape[1:]), empty.dtype)
+        for number in np.unique(chunk):
+            mine = rows[chunk == number]
+            first = int(mine.min())
+            values[chunk == number] = decoder.read(first, int(mine.max()) + 1, columns)[
+                mine - first
+            ]
+        return values
 
     def chunk_rows(self, name: str) -> int:
         """Rows in a chunk (or shard) of an array: the unit in which it is read or written."""
         axis = self.documents[name]["dimension_names"].index(self.specs[name].axis)
         return int(self.documents[name]["chunk_grid"]["configuration"]["chunk_shape"][axis])
 
-    def _require(self, name: str, array: zarr.Array[Any], rows: Any, axis: int) -> None:
-        """Every chunk of the rows must exist: plain Zarr would read fill values, and allocate."""
-        size = self.chunk_rows(name)
-        n = array.shape[axis]
-        if isinstance(rows, slice):
-            start, stop, _ = rows.indices(n)
-            chunks = range(start // size, -(-stop // size)) if stop > start else range(0)
-        else:
-            chunks = np.unique(np.atleast_1d(rows) // size).tolist()
-        for chunk in chunks:
-            index = [0] * array.ndim
-            index[axis] = chunk
-            key = "/".join([name, "c", *map(str, index)])
-            if not self.objects.exists(key):
-                raise missing_object(key, self.path)
-
     def _by_column(self, name: str) -> bool:
         """Whether rows are the last axis of an array, as in the archive profile."""
         return bool(self.documents[name]["dimension_names"][0] != self.specs[name].axis)
 
-    def _decoder(self, name: str) -> RowDecoder | None:
+    def _decoder(self, name: str) -> RowDecoder:
         if name not in self._decoders:
-            document, by_column = self.documents[name], self._by_column(name)
-            try:
-                decoder = RowDecoder(self.objects, name, document, by_column=by_column)
-            except NotImplementedError:
-                decoder = None
-            self._decoders[name] = decoder
+            document, tags = self.documents[name], self.tags.get(name, "")
+            by_column = self._by_column(name)
+            self._decoders[name] = RowDecoder(
+                self.objects, name, document, tags, by_column=by_column
+            )
         return self._decoders[name]
 
-    def _array(self, name: str) -> zarr.Array[Any]:
-        if name not in self._readable:
-            store = _CommittedStore(self.objects, name, self.documents[name])
-            self._readable[name] = open_array(store, name, "r", str(self.path))
-        return self._readable[name]
-
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_readable": {}, "_decoders": {}}
-
-
-class _CommittedStore(MemoryStore):
-    """One array as Zarr sees it: checked metadata from memory, chunks from where they are.
-
-    Plain Zarr reads a missing chunk as fill value. All chunks of committed rows are written, even
-    empty ones, so here a missing chunk is damage.
-    """
-
-    def __init__(self, objects: Objects, name: str, document: dict[str, Any]) -> None:
-        content = default_buffer_prototype().buffer.from_bytes(array_document(document))
-        super().__init__({f"{name}/zarr.json": content}, read_only=True)
-        self._objects = objects
-
-    async def get(
-        self,
-        key: str,
-        prototype: BufferPrototype | None = None,
-        byte_range: ByteRequest | None = None,
-    ) -> Buffer | None:
-        if "/c/" not in key:
-            return await super().get(key, prototype, byte_range)
-        start, stop = 0, None
-        if isinstance(byte_range, RangeByteRequest):
-            start, stop = byte_range.start, byte_range.end
-        elif isinstance(byte_range, OffsetByteRequest):
-            start = byte_range.offset
-        elif isinstance(byte_range, SuffixByteRequest):
-            start = -byte_range.suffix
-        value = self._objects.read(key, start, stop)
-        if value is None:
-            raise missing_object(key, self._objects.path)
-        return (prototype or default_buffer_prototype()).buffer.from_bytes(value)
+        return {**self.__dict__, "_decoders": {}}
 
 
 def objects_at(path: Path) -> FolderObjects | ZipObjects:
@@ -210,11 +154,11 @@ def objects_at(path: Path) -> FolderObjects | ZipObjects:
 
 def read_info(path: Path) -> RunInfo:
     """Metadata of the run at a path; raises as ``RunStore.open`` does."""
-    return read_metadata(objects_at(path))[0]
+    return read_metadata(objects_at(path)).info
 
 
-def read_metadata(objects: Objects) -> tuple[RunInfo, Documents]:
-    """The checked metadata of a run and of its arrays.
+def read_metadata(objects: Objects) -> Metadata:
+    """The checked metadata of a run, of its arrays and chunks.
 
     Raises:
         FormatError: it is no run of this format, or asks for what no reader should do.
@@ -241,12 +185,22 @@ def read_metadata(objects: Objects) -> tuple[RunInfo, Documents]:
             where=where,
             do="restore the file from a copy",
         )
-    documents = _array_documents(document, where)
+    documents, tags = _array_documents(document, where), attributes.get(TAGS)
     for name, spec in arrays_of(info).items():
         if name not in documents:
             raise FormatError("the run lacks an array", expected=name, where=where)
         check_array(spec, documents[name], info.committed(spec.axis), f"{objects.path}, {name}")
-    return info, documents
+        expected = 8 * chunk_count(documents[name])
+        tag = tags.get(name) if isinstance(tags, dict) else None
+        if not isinstance(tag, str) or len(tag) != expected:
+            raise FormatError(
+                "the run's metadata do not have the checksum of each chunk",
+                expected=f"{expected} hexadecimal digits",
+                got=tag if tag is None else f"{len(tag)} characters",
+                where=f"{objects.path}, {name}",
+                do="restore the run from a copy",
+            )
+    return Metadata(info=info, documents=documents, tags=tags)  # type: ignore[arg-type]
 
 
 def _array_documents(document: dict[str, Any], where: str) -> Documents:
@@ -269,12 +223,19 @@ def _array_documents(document: dict[str, Any], where: str) -> Documents:
     return arrays
 
 
-def group_document(info: RunInfo, documents: Documents) -> bytes:
-    """``zarr.json`` of a run's group, with the metadata of its arrays and the checksum."""
+def chunk_count(document: dict[str, Any]) -> int:
+    """Chunks of an array's rows, those inside shards counted one by one."""
+    outer = tuple(document["chunk_grid"]["configuration"]["chunk_shape"])
+    chunk = unshard(document["codecs"], outer)[1]
+    return math.prod(-(-n // c) for n, c in zip(document["shape"], chunk, strict=True))
+
+
+def group_document(info: RunInfo, documents: Documents, tags: dict[str, str]) -> bytes:
+    """``zarr.json`` of a run's group, with the metadata of its arrays and the checksums."""
     document = {
         "zarr_format": 3,
         "node_type": "group",
-        "attributes": {ATTRIBUTE: to_json(info)},
+        "attributes": {ATTRIBUTE: to_json(info), TAGS: tags},
         "consolidated_metadata": {
             "kind": "inline",
             "must_understand": False,
@@ -308,26 +269,20 @@ def checksum(metadata: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:
-    """Open an array by Zarr.
-
-    Raises:
-        DamageError: its metadata cannot be parsed.
-        MissingExtraError: its codec is not installed.
-    """
-    try:
-        with zarr.config.set(_EMPTY_CHUNKS), quiet_codecs():
-            return zarr.open_array(store, path=name, mode=mode, zarr_format=3)
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"the archive profile needs {error.name}, which is not installed",
-            where=where,
-            do="pip install 'numcodecs[pcodec]'",
-        ) from error
-    except Exception as error:  # Zarr has no error of its own for metadata it cannot parse
-        raise DamageError(
-            "the metadata of an array is damaged",
-            got=repr(error),
-            where=f"{where}, array {name!r}",
-            do="restore the run from a copy",
-        ) from error
+def _columns(
+    rest: list[Any], inner: tuple[int, ...]
+) -> tuple[tuple[int, int] | None, tuple[Any, ...]]:
+    """Bounds of the columns that a selection touches, and what then selects among them."""
+    if not rest or len(inner) != 1 or rest[0] is Ellipsis or rest[0] is None:
+        return None, tuple(rest)
+    n, first = inner[0], rest[0]
+    if isinstance(first, slice):
+        start, stop, step = first.indices(n)
+        if step < 1:
+            return None, tuple(rest)
+        return (start, max(start, stop)), (slice(None, None, step), *rest[1:])
+    index = np.arange(n)[first]  # raises IndexError as numpy does
+    if not index.size:
+        return (0, 0), (index, *rest[1:])
+    low = int(index.min())
+    return (low, int(index.max()) + 1), (index - low, *rest[1:])
