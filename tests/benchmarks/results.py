@@ -36,7 +36,10 @@ def render(results: dict[str, Any]) -> str:
         cells = []
         for rows in sizes.values():
             fastest = rows["torch.save, a file a snapshot"]["cpu_s"] / rows[way]["cpu_s"]
-            cells += [f"{rows[way]['size_of_raw']:.3f}", f"{fastest:.3g}x"]
+            cells += [
+                f"{rows[way]['size_of_raw']:.3f}",
+                f"{fastest:,.0f}x" if fastest >= 100 else f"{fastest:.3g}x",
+            ]
         lines.append(f"| {way} | " + " | ".join(cells) + " |")
     opening = results["format"]["opening"]
     lines += [
@@ -44,7 +47,7 @@ def render(results: dict[str, Any]) -> str:
         "Size: of raw float32. Read: how many times faster than `torch.load` of a file a snapshot, "
         "in CPU time, digests checked.",
         f"A data set of {opening['runs']} runs is {opening['objects']} objects; from its path to "
-        f"the first window take {opening['first_window_s']:.2f} s.",
+        f"the first window takes {opening['first_window_s']:.2f} s.",
     ]
     if "load" in results:
         lines.append(_load(results["load"]))
