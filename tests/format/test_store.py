@@ -598,3 +598,38 @@ def test_a_run_under_anothers_name_is_refused(small_dataset: Path, tmp_path: Pat
     shutil.copy(path / "runs/seed0000.zarr.zip", path / "runs/seed0001.zarr.zip")
     with pytest.raises(FormatError, match="not the one that the data set lists"):
         print(wt.open(path))
+
+
+def test_a_kill_between_a_rewritten_block_and_its_commit_loses_nothing(tmp_path: Path) -> None:
+    """A block that was committed half full is written again, whole, before the commit says so."""
+    path = tmp_path / "run.zarr"
+    script = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from tests.format.test_store import INFO, RunWriter, append, weights\n"
+        "from weighttraj.format import live\n"
+        "writer = RunWriter(Path(sys.argv[1]), INFO, resume=True)\n"
+        "kill = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "for t, row in enumerate(weights(16)):\n"
+        "    if t == 15: live.replace_file = kill\n"
+        "    append(writer, t, row)\n"
+    )
+    for status in ("crashed", "collecting"):
+        shutil.rmtree(path, ignore_errors=True)
+        writer = RunWriter(path, INFO)
+        for t, row in enumerate(weights(11)):
+            append(writer, t, row)
+        writer.close(status)
+        done = subprocess.run(
+            [sys.executable, "-c", script, str(path)],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=Path(__file__).parents[2],
+        )
+        assert done.returncode == -9, done.stderr
+        run = wt.open_run(path)
+        assert np.array_equal(run.weights[:], weights(11))
+        assert wt.verify(path) == []
+        assert np.array_equal(write(path, resume=True).weights[:], weights(20))
+        assert wt.verify(path) == []

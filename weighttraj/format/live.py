@@ -181,12 +181,25 @@ class LiveStore(RunStore):
         for name, spec in self.specs.items():
             axis = documents[name]["dimension_names"].index(spec.axis)
             documents[name]["shape"][axis] = info.committed(spec.axis)
-        tags = {n: self.tags[n][: 8 * chunk_count(documents[n])] for n in self.specs}
+        tags = {n: self._final(n, self.tags[n], documents[n], info) for n in self.specs}
         tags |= {name: tag for name, tag in self.tags.items() if name not in self.specs}
         replace_file(self.path / "zarr.json", group_document(info, documents, tags))
         self.info, self.documents, self.tags = info, documents, tags
         self._decoders.clear()
         self.write_members()
+
+    def _final(self, name: str, tags: str, document: dict[str, Any], info: RunInfo) -> str:
+        """Checksums of the committed chunks that will not change.
+
+        A partly filled chunk is written again when it grows, before the commit that says so: a
+        writer killed in between must not leave another chunk than was committed.
+        """
+        tags = tags[: 8 * chunk_count(document)]
+        rows, size = info.committed(self.specs[name].axis), self.chunk_rows(name)
+        if info.status != "collecting" or rows % size == 0:
+            return tags
+        changing = len(tags) // -(-rows // size)
+        return tags[:-changing] + "-" * changing
 
     def write_members(self) -> None:
         """Write the metadata of groups and arrays where they differ from the run's.

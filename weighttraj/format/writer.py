@@ -75,6 +75,8 @@ class RunWriter:
         self._compared: dict[Axis, int] = dict.fromkeys(AXES, 0)
         self._blocks: dict[Axis, _Block] = {axis: self._tail(axis) for axis in AXES}
         self._closed = False
+        if info.status != "collecting":  # say so before any chunk changes
+            self._store.commit(with_progress(info, status="collecting", **self._at_start))
 
     @property
     def info(self) -> RunInfo:
