@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := data/demo
 
-.PHONY: demo test lint bench setup clean-demo
+.PHONY: demo test lint bench stress setup clean-demo
 
 setup: .venv/installed
 
@@ -25,8 +25,16 @@ lint: setup ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: setup ## run every benchmark by hand; each prints one JSON line
-	for f in tests/benchmarks/bench_*.py; do $(BIN)/python -W ignore $$f; done
+bench: setup ## measure on two real runs (an hour to collect them), keep the numbers, write them into README
+	$(BIN)/weighttraj collect tests/benchmarks/inverted-pendulum.toml --out data/bench/inverted-pendulum
+	$(BIN)/weighttraj collect tests/benchmarks/half-cheetah.toml --out data/bench/half-cheetah
+	$(BIN)/python -W ignore tests/benchmarks/bench_format.py data/bench/*/runs/*.zarr.zip --save
+	WEIGHTTRAJ_CACHE=data/bench/cache $(BIN)/python -W ignore tests/benchmarks/bench_load.py data/bench/*/runs/*.zarr.zip --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_callback.py --save
+	$(BIN)/python tests/benchmarks/results.py
+
+stress: setup ## kill, flip, delete, fuzz: about an hour
+	$(BIN)/python -W ignore tests/benchmarks/stress_format.py
 
 clean-demo: ## forget the demo's data
 	rm -rf $(DEMO)
