@@ -84,6 +84,12 @@ def run(tmp_path: Path) -> wt.Run:
     return write(tmp_path / "run.zarr")
 
 
+def in_a_process(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", script, *map(str, arguments)]
+    root = Path(__file__).parents[2]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
+
+
 def chunk_files(run: wt.Run, array: str = "") -> list[Path]:
     return sorted(p for p in (run.path / array).rglob("c/**/*") if p.is_file())
 
@@ -239,10 +245,7 @@ with RunWriter(Path(sys.argv[1]), INFO) as writer:
 )
 def test_a_killed_writer_leaves_what_it_had_committed(tmp_path: Path, place: str, n: int) -> None:
     path = tmp_path / "run.zarr"
-    command = [sys.executable, "-c", KILLED_WHILE_WRITING, str(path), place, str(n)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
-    )
+    done = in_a_process(KILLED_WHILE_WRITING, path, place, n)
     assert done.returncode == -9, done.stderr
     reported = int((done.stdout.split() or ["0"])[-1])
     run = wt.open_run(path)
@@ -541,13 +544,7 @@ def test_a_full_disk_leaves_what_was_committed(tmp_path: Path) -> None:
         "for t, row in enumerate(weights(16)): append(writer, t, row)\n"
     )
     writer.close("crashed")
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).parents[2],
-    )
+    done = in_a_process(script, path)
     assert "File too large" in done.stderr
     assert len(wt.open_run(path)) == 8
     assert wt.verify(path) == []
@@ -620,13 +617,7 @@ def test_a_kill_between_a_rewritten_block_and_its_commit_loses_nothing(tmp_path:
         for t, row in enumerate(weights(11)):
             append(writer, t, row)
         writer.close(status)
-        done = subprocess.run(
-            [sys.executable, "-c", script, str(path)],
-            capture_output=True,
-            text=True,
-            check=False,
-            cwd=Path(__file__).parents[2],
-        )
+        done = in_a_process(script, path)
         assert done.returncode == -9, done.stderr
         run = wt.open_run(path)
         assert np.array_equal(run.weights[:], weights(11))

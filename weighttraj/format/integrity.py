@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from weighttraj.format.objects import ZipObjects
 from weighttraj.format.packing import same_as_packed
 from weighttraj.format.reader import Dataset, Run, StoredArray, open_dataset, open_run
 from weighttraj.format.schema import AXES, Axis, load_json
-from weighttraj.format.storage import PACKED, RunStore, member_documents
+from weighttraj.format.storage import PACKED, RunStore, member_documents, object_grid
 from weighttraj.format.tables import write_tables
 from weighttraj.format.writer import lock_run
 
@@ -99,11 +98,13 @@ def repair(path: str | Path, *, cut: bool = False) -> list[str]:
     if not (path / "dataset.json").is_file():
         return _repair_run(path, cut)
     info = read_dataset_info(path)
-    done = [step for run in info.runs for step in _repair_entry(path, run.path, cut)]
+    steps = {run.path: _repair_entry(path, run.path, cut) for run in info.runs}
+    done = [step for entry in steps.values() for step in entry]
     if info.status == "complete":
-        info = read_dataset_info(path)
-        damaged = [run.path for run in info.runs if _problems_of(path / run.path)]
-        if damaged or info.status != "complete":
+        # A packed run of which nothing is to be said was just found whole.
+        again = [entry for entry in steps if steps[entry] or not entry.endswith(PACKED)]
+        damaged = [entry for entry in again if _problems_of(path / entry)]
+        if damaged or read_dataset_info(path).status != "complete":
             return [*done, "the manifest is not written again: the data set is not whole"]
         if check_manifest_quietly(path):
             seal(path)
@@ -168,7 +169,7 @@ def _verify_objects(store: RunStore) -> Iterator[str]:
     present = set(_names(store))
     expected = {"zarr.json", *documents}
     for name in store.documents:
-        if (count := _chunk_count(store, name)) > len(present):
+        if (count := math.prod(object_grid(store.documents[name]))) > len(present):
             yield f"{store.path}, {name}: {count} chunks expected, only {len(present)} objects"
             return
         expected |= set(_chunk_keys(store, name))
@@ -206,20 +207,9 @@ def _verify_array(name: str, array: StoredArray, *, where: str) -> Iterator[str]
             last = rows[-1:]
 
 
-def _grid(store: RunStore, name: str) -> list[int]:
-    """Chunks of an array's committed rows, along each axis."""
-    document: Any = store.documents[name]
-    sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
-    return [-(-n // c) for n, c in zip(document["shape"], sizes, strict=True)]
-
-
-def _chunk_count(store: RunStore, name: str) -> int:
-    return math.prod(_grid(store, name))
-
-
 def _chunk_keys(store: RunStore, name: str) -> Iterator[str]:
     """Names of all chunks of an array's committed rows."""
-    for index in itertools.product(*map(range, _grid(store, name))):
+    for index in itertools.product(*map(range, object_grid(store.documents[name]))):
         yield "/".join([name, "c", *map(str, index)])
 
 
@@ -228,7 +218,7 @@ def _is_chunk(store: RunStore, name: str) -> bool:
     array, _, index = name.rpartition("/c/")
     if array not in store.documents or re.fullmatch(r"\d{1,18}(/\d{1,18})*", index) is None:
         return False
-    place, grid = [int(i) for i in index.split("/")], _grid(store, array)
+    place, grid = [int(i) for i in index.split("/")], object_grid(store.documents[array])
     plain = "/".join(map(str, place)) == index and len(place) == len(grid)
     return plain and all(i < n for i, n in zip(place, grid, strict=True))
 

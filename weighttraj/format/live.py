@@ -30,6 +30,7 @@ from weighttraj.format.storage import (
     chunk_count,
     group_document,
     member_documents,
+    object_grid,
     read_metadata,
 )
 
@@ -124,9 +125,7 @@ class LiveStore(RunStore):
 
     def _tags_on_disk(self, name: str, chunk: int) -> str:
         """The crc32c that ends each chunk of some rows, which lie in objects of their own."""
-        document = self.documents[name]
-        sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
-        counts = [-(-n // c) for n, c in zip(document["shape"], sizes, strict=True)]
+        counts = object_grid(self.documents[name])
         others = counts[:-1] if self._by_column(name) else counts[1:]
         keys = [self._key(name, chunk, place) for place in np.ndindex(*others)]
         return "".join([(self.objects.read(key, -4) or b"").hex() for key in keys])

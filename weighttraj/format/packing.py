@@ -75,20 +75,16 @@ def same_as_packed(path: Path) -> bool:
 
     So every byte counts, also those of the zip file's directory that no reader looks at.
     """
-    objects = ZipObjects(path)
-    with tempfile.TemporaryDirectory() as folder:
-        members = [(n, Path(folder) / str(i)) for i, n in enumerate(objects.names)]
-        for name, file in members:
-            file.write_bytes(objects.read(name) or b"")
-        again = Path(folder) / "again.zip"
-        write_zip(again, members)
+    with unpacked(path) as folder:
+        again = folder.with_name("again.zip")
+        write_zip(again, ((name, folder / name) for name in ZipObjects(path).names))
         return _equal(path, again)
 
 
 @contextlib.contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
-    """A packed run as a folder beside it, for as long as the context lasts."""
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+    """A packed run as a folder, for as long as the context lasts; nothing is written beside it."""
+    with tempfile.TemporaryDirectory() as folder:
         objects = ZipObjects(path)
         for name in objects.names:
             file = Path(folder) / "run.zarr" / name

@@ -223,6 +223,12 @@ def _array_documents(document: dict[str, Any], where: str) -> Documents:
     return arrays
 
 
+def object_grid(document: dict[str, Any]) -> list[int]:
+    """Objects of an array's rows along each axis: its chunks, or its shards."""
+    sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
+    return [-(-n // c) for n, c in zip(document["shape"], sizes, strict=True)]
+
+
 def chunk_count(document: dict[str, Any]) -> int:
     """Chunks of an array's rows, those inside shards counted one by one."""
     outer = tuple(document["chunk_grid"]["configuration"]["chunk_shape"])
