@@ -14,6 +14,8 @@ setup: .venv/installed
 
 demo: setup ## collect four runs, train TIPL on three, judge it on the fourth: about five minutes
 	$(BIN)/weighttraj collect datasets/demo/recipe.toml --out $(DEMO)/dataset --workers 2
+	$(BIN)/weighttraj returns $(DEMO)/dataset --every 25 --episodes 5
+	$(BIN)/weighttraj report $(DEMO)/dataset --out $(DEMO)/dataset.html
 	$(BIN)/tipl train --data $(DEMO)/dataset --out $(DEMO)/tipl --n-batches 500 --warmup 100 --save-every 100
 	$(BIN)/tipl evaluate $(DEMO)/tipl --data $(DEMO)/dataset --out $(DEMO)/report --return-starts 5 --episodes 5
 
@@ -31,6 +33,7 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_format.py data/bench/*/runs/*.zarr.zip --save
 	WEIGHTTRAJ_CACHE=data/bench/cache $(BIN)/python -W ignore tests/benchmarks/bench_load.py data/bench/*/runs/*.zarr.zip --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_callback.py --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_returns.py data/bench/inverted-pendulum data/bench/half-cheetah --save
 	$(BIN)/python tests/benchmarks/results.py
 
 stress: setup ## kill, flip, delete, fuzz: about an hour

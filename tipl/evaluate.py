@@ -19,7 +19,7 @@ from tipl.baselines import Persistence, Reconstruction
 from tipl.errors import EvaluateError
 from tipl.forecast import TIPL, Forecaster
 from tipl.report import write_report
-from weighttraj.policies import Evaluator, Policy, env_of
+from weighttraj.policies import Evaluator, PolicyBatch, env_of, load_policies
 
 Mode = Literal["deterministic", "sampled"]
 MAX_BYTES = 256 * 2**20
@@ -191,7 +191,7 @@ def _all_returns(
 
 
 class _Scorer:
-    """Mean return of a policy; equal weights are played once."""
+    """Mean returns of policies; equal weights are played once."""
 
     def __init__(
         self,
@@ -204,18 +204,24 @@ class _Scorer:
         self._evaluators = {"same": evaluator, "fresh": fresh}
         self._deterministic = deterministic
         self._progress, self._bar = progress, bar
-        self._known: dict[tuple[str, bytes, bytes], float] = {}
+        self._known: dict[tuple[str, bytes], float] = {}
 
-    def __call__(self, policy: Policy, episodes: str = "same") -> float:
-        self._progress.advance(self._bar)
-        stats = policy.stats
-        norm = b"" if stats is None else stats.mean.tobytes() + stats.var.tobytes()
-        key = (episodes, policy.weights.tobytes(), norm)
-        if key not in self._known:
-            play = self._evaluators[episodes]
-            played = play(policy, deterministic=self._deterministic)
-            self._known[key] = float(played.returns.mean())
-        return self._known[key]
+    def __call__(self, policies: PolicyBatch, episodes: str = "same") -> np.ndarray:
+        """Mean returns, (policy,)."""
+        keys = [(episodes, key) for key in _keys(policies)]
+        rows = {key: row for row, key in enumerate(keys) if key not in self._known}
+        if rows:
+            some = policies[list(rows.values())]
+            played = self._evaluators[episodes](some, deterministic=self._deterministic)
+            self._known |= dict(zip(rows, played.returns.mean(1).tolist(), strict=True))
+        self._progress.advance(self._bar, len(policies))
+        return np.array([self._known[key] for key in keys])
+
+
+def _keys(policies: PolicyBatch) -> list[bytes]:
+    """What tells one policy from another: its weights and its normaliser."""
+    parts = [x for x in (policies.weights, policies.mean, policies.var) if x is not None]
+    return [b"".join([part[row].tobytes() for part in parts]) for row in range(len(policies))]
 
 
 def _returns_of_run(
@@ -227,20 +233,19 @@ def _returns_of_run(
 ) -> _Returns:
     starts = np.linspace(0, len(run) - 1 - max(horizons), config.return_starts).astype(int)
     shape = (len(starts), len(horizons))
-    true, again = np.zeros(shape), np.zeros(shape)
-    by_name = {f.name: np.zeros(shape) for f in forecasters}
-    forecasts = {f.name: f.forecast(run, starts.tolist(), horizons.tolist()) for f in forecasters}
-    floors = {f.name for f in forecasters if isinstance(f, Reconstruction)}
-    for i, t in enumerate(starts):
-        now = run.load_policy(int(t))
-        for j, h in enumerate(horizons):
-            later = run.load_policy(int(t + h))
-            true[i, j] = score(later)
-            again[i, j] = score(later, "fresh") if i == 0 or j == 0 else np.nan
-            for name, weights in forecasts.items():
-                # A forecast acts with the normaliser of its start: the later one is the future's.
-                base = later if name in floors else now
-                by_name[name][i, j] = score(base.with_weights(weights[i, j]))
+    later = load_policies(run, (starts[:, None] + horizons).ravel())
+    # A forecast acts with the normaliser of its start: the later one is the future's.
+    now = load_policies(run, np.repeat(starts, len(horizons)))
+    again, edge = np.full(shape, np.nan), np.zeros(shape, bool)
+    edge[0] = edge[:, 0] = True
+    again[edge] = score(later[edge.ravel()], "fresh")
+    true = score(later).reshape(shape)
+    by_name = {}
+    for forecaster in forecasters:
+        weights = forecaster.forecast(run, starts.tolist(), horizons.tolist())
+        base = later if isinstance(forecaster, Reconstruction) else now
+        policies = base.with_weights(weights.reshape(len(base), -1))
+        by_name[forecaster.name] = score(policies).reshape(shape)
     return _Returns(true, again, by_name)
 
 

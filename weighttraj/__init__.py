@@ -12,6 +12,7 @@ from typing import Any
 
 from weighttraj.format import (
     Dataset,
+    Evaluation,
     ParamLayout,
     Run,
     RunInfo,
@@ -24,6 +25,8 @@ from weighttraj.format import (
     pack,
     repair,
     seal,
+    store_returns,
+    unseal,
     verify,
 )
 
@@ -33,6 +36,7 @@ open = open_dataset
 
 __all__ = [
     "Dataset",
+    "Evaluation",
     "ParamLayout",
     "Run",
     "RunInfo",
@@ -49,12 +53,15 @@ __all__ = [
     "open_run",
     "pack",
     "policies",
+    "publish",
     "repair",
     "seal",
+    "store_returns",
+    "unseal",
     "verify",
 ]
 
-_ROOMS = ("collect", "load", "policies")
+_ROOMS = ("collect", "load", "policies", "publish")
 _HDF5 = ("export_hdf5", "import_hdf5")
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
@@ -43,6 +44,56 @@ def _collect(args: _Collect) -> None:
     dataset = wt.collect.collect(recipe, out, seeds=seeds, workers=args.workers, console=console)
     print(dataset)
     print(f"data set in {out}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Returns:
+    path: tyro.conf.Positional[Path]
+    """Data set."""
+    episodes: int = 10
+    """Episodes for each action mode; the same seeds for every policy."""
+    every: int = 10
+    """Evaluate every so many-th snapshot, and the last one."""
+    first: int = 0
+    """And all of the first so many: policies change most at the start."""
+    mode: Literal["both", "deterministic", "sampled"] = "both"
+    """How the policies act: the distribution's mode, samples, or both in turn."""
+    seed: int = 0
+    """Seed of the first episode."""
+    workers: int = 1
+    """Processes, each with one thread."""
+    replace: bool = False
+    """Evaluate anew what has returns of other episodes or other versions of the physics."""
+
+
+@app.command(name="returns")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _returns(args: _Returns) -> None:
+    """Evaluate stored policies: their returns J(pi) become part of the runs; or go on."""
+    config = wt.policies.ReturnsConfig(
+        episodes=args.episodes,
+        every=args.every,
+        first=args.first,
+        modes=("deterministic", "sampled") if args.mode == "both" else (args.mode,),
+        seed=args.seed,
+    )
+    dataset = wt.policies.fill_returns(
+        args.path, config, workers=args.workers, replace=args.replace, console=console
+    )
+    for run in dataset:
+        if run.evaluation is not None:
+            print(f"{run.id}: mean return of the last snapshot {_last_return(run)}")
+
+
+def _last_return(run: wt.Run) -> str:
+    modes = {True: "deterministic", False: "sampled"}
+    stored = run.evaluation.deterministic if run.evaluation else ()
+    values = {modes[m]: run.mean_return(m) for m in (True, False) if m in stored}
+    return ", ".join(
+        f"{value[np.isfinite(value)][-1]:.1f} ({mode})"
+        for mode, value in values.items()
+        if np.isfinite(value).any()
+    )
 
 
 @app.command(name="show")
@@ -121,6 +172,38 @@ class _Pack:
 def _pack(args: _Pack) -> None:
     """Write a finished run into one file; the run itself stays."""
     print(wt.pack(args.path, profile=args.profile, out=args.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Report:
+    path: tyro.conf.Positional[Path]
+    """Data set or run."""
+    out: Path = Path("report.html")
+    """Page to be written: one file that opens from disk. An earlier report is replaced."""
+    film: bool = True
+    """A short film of a policy at five moments of its training."""
+    seed: int = 0
+    """Of the film's episodes."""
+    overwrite: bool = False
+    """Replace the file, whatever it is."""
+
+
+@app.command(name="report")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _report(args: _Report) -> None:
+    """Write a page that shows what a data set or a run holds: returns, steps, spectrum, film."""
+    from weighttraj.publish.report import report
+
+    print(
+        report(
+            args.path,
+            args.out,
+            film=args.film,
+            seed=args.seed,
+            overwrite=args.overwrite,
+            console=console,
+        )
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,19 +38,29 @@ def make(env_id: str, **kwargs: Any) -> gym.Env[Any, Any]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence deprecations that only the environments' authors can act on.
+    """Silence deprecations that only the environments' authors can act on."""
+    with quiet_mujoco(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*is out of date.*", DeprecationWarning)
+        yield
 
-    MuJoCo prints one for HalfCheetah's model and writes MUJOCO_LOG.TXT where the program runs.
+
+@contextlib.contextmanager
+def quiet_mujoco() -> Iterator[None]:
+    """Without MuJoCo's own messages, which it also writes to MUJOCO_LOG.TXT in the current folder.
+
+    They tell of deprecated models, and of unstable simulations.
     """
     try:
         import mujoco
     except ModuleNotFoundError:
         yield
         return
-    mujoco.set_mju_user_warning(lambda message: None)
+    mujoco.set_mju_user_warning(_ignore)
     try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*is out of date.*", DeprecationWarning)
-            yield
+        yield
     finally:
         mujoco.set_mju_user_warning(None)
+
+
+def _ignore(message: str) -> None:
+    pass

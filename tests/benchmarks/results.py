@@ -58,7 +58,18 @@ def render(results: dict[str, Any]) -> str:
             f"{100 * (callback['ratio_inside'] - 1):.2g} % of the training's CPU time and "
             f"{callback['extra_peak_mib'] / callback['block_mib']:.1f} blocks of memory."
         )
+    lines += [_returns(row) for row in results.get("returns", {}).values()]
     return "\n".join(lines)
+
+
+def _returns(row: dict[str, Any]) -> str:
+    units = "x".join(map(str, row["units"]))
+    return (
+        f"Returns of {row['policies']} policies x {row['episodes']} episodes, {row['env']} {units}: "
+        f"{row['over_sb3']:.1f} times as fast as `evaluate_policy` one after another, "
+        f"{row['over_limit']:.2f} of the speed of the bare physics; two threads "
+        f"{row['two_threads']:.1f} times as fast as one."
+    )
 
 
 def _load(load: dict[str, Any]) -> str:

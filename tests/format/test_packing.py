@@ -175,7 +175,7 @@ def test_arrays_of_a_later_version_are_read_over_and_not_lost(tmp_path: Path) ->
     (run.path / "eval/later/c").mkdir()
     for file in (run.path / "index/phase/c").iterdir():
         (run.path / "eval/later/c" / file.name).write_bytes(file.read_bytes())
-    (run.path / "zarr.json").write_bytes(group_document(run.info, documents, store.tags))
+    (run.path / "zarr.json").write_bytes(group_document(run.info, documents, store.tags, {}))
     assert wt.verify(run.path) == []
     assert "eval/later" not in wt.open_run(run.path).arrays
     with pytest.raises(FormatError, match=r"(?s)does not know.*eval/later"):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import weighttraj.format
 from tests.golden.make import INFO
-from weighttraj.format import FORMAT_VERSION, DatasetInfo, RunEntry, RunInfo
+from weighttraj.format import FORMAT_VERSION, DatasetInfo, Evaluation, RunEntry, RunInfo
 from weighttraj.format.catalog import DATASET, MANIFEST
 from weighttraj.format.codecs import KNOWN_CODECS, MAX_CHUNK_PARAMS, MAX_NARROW
 from weighttraj.format.schema import arrays_of
@@ -43,7 +43,8 @@ def test_the_arrays() -> None:
         for name in names(cells[0]):
             specified[name] = (cells[1], tuple(cells[2].split(", ")))
     coded = {}
-    for spec in arrays_of(INFO).values():
+    evaluation = Evaluation(seeds=(0,), deterministic=(True,))
+    for spec in arrays_of(dataclasses.replace(INFO, evaluation=evaluation)).values():
         name = "train/<name>" if spec.name.startswith("train/") else spec.name
         coded[name] = (spec.dtype, spec.dims)
     assert specified == coded
@@ -63,6 +64,6 @@ def test_the_objects() -> None:
 
 
 def test_the_metadata() -> None:
-    for kind in (RunInfo, DatasetInfo, RunEntry):
+    for kind in (RunInfo, DatasetInfo, RunEntry, Evaluation):
         for field in dataclasses.fields(kind):
             assert f"`{field.name}`" in SPEC, f"{kind.__name__}.{field.name}"

@@ -1,17 +1,19 @@
 """What lies on disk. ``FORMAT.md`` beside this file is the specification."""
 
 from weighttraj.format.export import export_npy, export_safetensors
-from weighttraj.format.integrity import repair, seal, verify
+from weighttraj.format.integrity import repair, seal, unseal, verify
 from weighttraj.format.layout import ParamLayout, ParamSpec
 from weighttraj.format.lint import lint
 from weighttraj.format.packing import pack
 from weighttraj.format.reader import Dataset, Run, open_dataset, open_run
+from weighttraj.format.returns import store_returns
 from weighttraj.format.schema import (
     FORMAT_VERSION,
     Algorithm,
     Cadence,
     DatasetInfo,
     EnvInfo,
+    Evaluation,
     ObsNorm,
     PolicySpec,
     Provenance,
@@ -27,6 +29,7 @@ __all__ = [
     "Dataset",
     "DatasetInfo",
     "EnvInfo",
+    "Evaluation",
     "ObsNorm",
     "ParamLayout",
     "ParamSpec",
@@ -44,5 +47,7 @@ __all__ = [
     "pack",
     "repair",
     "seal",
+    "store_returns",
+    "unseal",
     "verify",
 ]

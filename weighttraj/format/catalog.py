@@ -104,7 +104,8 @@ def read_manifest(path: Path) -> list[ManifestLine]:
             expected=MANIFEST,
             got=error,
             where=path,
-            do="restore it from a copy, or write it again: weighttraj repair",
+            do="if a command that changes the data set was stopped, give it again; else restore "
+            "the manifest from a copy, or write it again: weighttraj repair",
         ) from error
     lines = []
     for number, line in enumerate(text.split("\n")[:-1], start=1):

@@ -22,10 +22,11 @@ from weighttraj.format.catalog import (
     write_manifest,
 )
 from weighttraj.format.live import LiveStore
-from weighttraj.format.objects import ZipObjects
+from weighttraj.format.objects import ZipObjects, sync
 from weighttraj.format.packing import same_as_packed
 from weighttraj.format.reader import Dataset, Run, StoredArray, open_dataset, open_run
-from weighttraj.format.schema import AXES, Axis, load_json
+from weighttraj.format.returns import drop_returns, locked_path
+from weighttraj.format.schema import AXES, RETURNS, Axis, load_json
 from weighttraj.format.storage import PACKED, RunStore, member_documents, object_grid
 from weighttraj.format.tables import write_tables
 from weighttraj.format.writer import lock_run
@@ -33,6 +34,7 @@ from weighttraj.format.writer import lock_run
 MONOTONE = ("index/iteration", "index/gradient_step", "index/num_timesteps")
 
 _DRAFT = re.compile(r"\..+\.\d+\.draft")
+_DROPPED = "damaged returns dropped; weighttraj returns evaluates the snapshots again"
 
 
 def verify(path: str | Path, *, deep: bool = False) -> list[str]:
@@ -77,6 +79,21 @@ def seal(path: str | Path) -> Dataset:
     return dataset
 
 
+def unseal(path: str | Path) -> None:
+    """Remove the manifest of a data set, before its runs are changed; ``seal`` writes it again.
+
+    A complete data set stays complete: it opens and has all its runs. Until it is sealed,
+    ``verify`` says that the manifest is missing. Where there is none, nothing is done.
+
+    Raises:
+        FileNotFoundError: there is no data set at the path.
+        FormatError: it is none of this format.
+    """
+    read_dataset_info(Path(path))
+    (Path(path) / MANIFEST).unlink(missing_ok=True)
+    sync(Path(path))
+
+
 def repair(path: str | Path, *, cut: bool = False) -> list[str]:
     """Mend what can be mended without the training; say what was done and what is left to do.
 
@@ -86,8 +103,8 @@ def repair(path: str | Path, *, cut: bool = False) -> list[str]:
 
     Args:
         path: data set or run.
-        cut: drop damaged snapshots, and those after them. The run is then ``crashed``, and
-            collecting its recipe again makes what was dropped, in the same bytes.
+        cut: drop damaged returns; drop damaged snapshots, and those after them. The run is then
+            ``crashed``, and collecting its recipe again makes what was dropped, in the same bytes.
 
     Raises:
         FileNotFoundError: there is neither a data set nor a run at the path.
@@ -246,6 +263,8 @@ def _repair_entry(dataset: Path, entry: str, cut: bool) -> list[str]:
         return []
     if not cut:
         return [*problems, f"{path}: damaged; --cut drops it, so that it is collected again"]
+    if _drop_packed_returns(path) and not _problems_of(path):
+        return [f"{path}: {_DROPPED}"]
     path.rename(path.with_name(f".{path.name}.damaged"))
     return _forget(dataset, entry)
 
@@ -268,6 +287,12 @@ def _repair_run(path: Path, cut: bool) -> list[str]:
         store = LiveStore.open(path)
         _sweep(store)
         done = [f"mended: {problem}" for problem in sorted(before)]
+        if _has_damaged_returns(store):
+            if cut:
+                drop_returns(store)
+                store = LiveStore.open(path)
+                _sweep(store)
+            done.append(f"{path}: {_DROPPED if cut else 'damaged returns; --cut drops them'}")
         rows = {axis: _whole_rows(store, axis) for axis in AXES}
         if all(rows[axis] == store.info.committed(axis) for axis in AXES):
             return done
@@ -289,6 +314,29 @@ def _repair_run(path: Path, cut: bool) -> list[str]:
     return [*done, f"{path}: cut to {rows['time']} snapshots; collect the recipe again"]
 
 
+def _has_damaged_returns(store: RunStore) -> bool:
+    if store.info.evaluation is None:
+        return False
+    try:
+        for name in RETURNS:
+            store.read(name, slice(None))
+    except DamageError:
+        return True
+    return False
+
+
+def _drop_packed_returns(path: Path) -> bool:
+    """Drop the returns of a packed run if they are damaged, and nothing else is; says so."""
+    try:
+        with lock_run(locked_path(path)):
+            store = RunStore.open(path)
+            if damaged := _has_damaged_returns(store):
+                drop_returns(store)
+            return damaged
+    except (FormatError, FileNotFoundError):
+        return False
+
+
 def _sweep(store: LiveStore) -> None:
     """Remove files that belong to nothing that was committed."""
     documents = member_documents(store.documents)
@@ -301,9 +349,10 @@ def _sweep(store: LiveStore) -> None:
 
 
 def _whole_rows(store: RunStore, axis: Axis) -> int:
-    """Rows before the first damaged one, in whole blocks."""
+    """Rows before the first damaged one, in whole blocks; returns can be got again."""
     n, block = store.info.committed(axis), store.info.block
-    arrays = {s.name: StoredArray(store, s) for s in store.specs.values() if s.axis == axis}
+    specs = [s for s in store.specs.values() if s.axis == axis and s.name not in RETURNS]
+    arrays = {s.name: StoredArray(store, s) for s in specs}
     for start in range(0, n, block):
         try:
             for array in arrays.values():
@@ -313,4 +362,4 @@ def _whole_rows(store: RunStore, axis: Axis) -> int:
     return n
 
 
-__all__ = ["repair", "seal", "verify"]
+__all__ = ["repair", "seal", "unseal", "verify"]

@@ -24,6 +24,7 @@ from weighttraj.format.objects import FolderObjects, refuse_existing, replace_fi
 from weighttraj.format.schema import RunInfo, arrays_of
 from weighttraj.format.storage import (
     PACKED,
+    Documents,
     Metadata,
     RunStore,
     array_document,
@@ -67,12 +68,7 @@ class LiveStore(RunStore):
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
         shutil.rmtree(draft, ignore_errors=True)
-        group = zarr.create_group(LocalStore(draft))
-        documents = {}
-        for name, spec in arrays_of(info).items():
-            rows = packed_rows[spec.axis] if packed_rows else None
-            create_array(group, spec, info.profile, info.block, rows)
-            documents[name] = json.loads((draft / name / "zarr.json").read_bytes())
+        documents = empty_arrays(draft, info, list(arrays_of(info)), packed_rows)
         tags = dict.fromkeys(documents, "")
         store = cls(FolderObjects(draft), Metadata(info=info, documents=documents, tags=tags))
         store.commit(info)
@@ -182,7 +178,8 @@ class LiveStore(RunStore):
             documents[name]["shape"][axis] = info.committed(spec.axis)
         tags = {n: self._final(n, self.tags[n], documents[n], info) for n in self.specs}
         tags |= {name: tag for name, tag in self.tags.items() if name not in self.specs}
-        replace_file(self.path / "zarr.json", group_document(info, documents, tags))
+        content = group_document(info, documents, tags, self.attributes)
+        replace_file(self.path / "zarr.json", content)
         self.info, self.documents, self.tags = info, documents, tags
         self._decoders.clear()
         self.write_members()
@@ -200,7 +197,7 @@ class LiveStore(RunStore):
         changing = len(tags) // -(-rows // size)
         return tags[:-changing] + "-" * changing
 
-    def write_members(self) -> None:
+    def write_members(self, *, durable: bool = False) -> None:
         """Write the metadata of groups and arrays where they differ from the run's.
 
         Readers of single arrays look there; those of the run, here or in plain Zarr, do not.
@@ -209,7 +206,7 @@ class LiveStore(RunStore):
             file = Path(self.objects.file(name))  # no link that leads elsewhere
             if not file.is_file() or file.read_bytes() != content:
                 file.parent.mkdir(parents=True, exist_ok=True)
-                replace_file(file, content, durable=False)
+                replace_file(file, content, durable=durable)
 
     def _files(self, name: str, start: int, stop: int) -> set[Path]:
         """Files and folders that hold some rows of an array."""
@@ -227,6 +224,26 @@ class LiveStore(RunStore):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_writable": {}, "_encoders": {}}
+
+
+def empty_arrays(
+    folder: Path, info: RunInfo, names: Sequence[str], packed_rows: dict[str, int] | None
+) -> Documents:
+    """Make a Zarr group with some of a run's arrays, without rows; returns their metadata.
+
+    Args:
+        folder: folder to be made.
+        info: the run.
+        names: the arrays.
+        packed_rows: rows of each axis in a run that is about to be packed; None: it is not.
+    """
+    group, specs = zarr.create_group(LocalStore(folder)), arrays_of(info)
+    documents = {}
+    for name in names:
+        rows = packed_rows[specs[name].axis] if packed_rows else None
+        create_array(group, specs[name], info.profile, info.block, rows)
+        documents[name] = json.loads((folder / name / "zarr.json").read_bytes())
+    return documents
 
 
 class _BlockStore(LocalStore):

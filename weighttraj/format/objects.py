@@ -9,7 +9,7 @@ import os
 import re
 import stat
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -17,6 +17,7 @@ from weighttraj.errors import DamageError, FormatError, StoreExistsError
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
+_PIECE_BYTES = 4 << 20
 
 MAX_NAME = 200
 """Characters between two slashes of a name: file systems take 255, drafts have longer ones."""
@@ -92,7 +93,8 @@ class ZipObjects:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            with zipfile.ZipFile(path) as archive:
+            with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+                self._inode = os.fstat(file.fileno()).st_ino
                 members, end = archive.infolist(), archive.start_dir
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
             if isinstance(error, FileNotFoundError):
@@ -105,6 +107,8 @@ class ZipObjects:
             ) from error
         self._members: dict[str, tuple[int, int]] = {}
         self._ends: dict[str, int] = {}
+        self.crc32 = {member.filename: member.CRC for member in members}
+        """What the file's directory says of each object: the CRC-32 of its bytes."""
         end = path.stat().st_size
         for member in members:
             if not 0 <= member.header_offset <= end - 30 - member.file_size:
@@ -145,6 +149,12 @@ class ZipObjects:
         offset, size = self._members[name]
         handle = os.open(self.path, os.O_RDONLY)
         try:
+            if os.fstat(handle).st_ino != self._inode:
+                raise FormatError(
+                    "the packed run was replaced after it was opened",
+                    where=self.path,
+                    do="open it again",
+                )
             header = os.pread(handle, 30, offset)
             skip = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
             first = offset + 30 + skip
@@ -157,6 +167,10 @@ class ZipObjects:
     def exists(self, name: str) -> bool:
         """See ``Objects``."""
         return name in self._members
+
+    def size(self, name: str) -> int:
+        """Bytes of an object that is there."""
+        return self._members[name][1]
 
     def _misplaced(self, name: str, offset: int) -> DamageError:
         return DamageError(
@@ -212,15 +226,34 @@ def missing_object(name: str, where: object) -> DamageError:
     )
 
 
-def write_zip(path: Path, members: Iterable[tuple[str, Path]]) -> None:
-    """Write files into a zip file: stored, without times, so equal content gives equal bytes."""
+def write_zip(path: Path, members: Iterable[tuple[str, Path | ZipObjects]]) -> None:
+    """Write files into a zip file: stored, without times, so equal content gives equal bytes.
+
+    Args:
+        path: the zip file.
+        members: names, each with a file, or with a zip file that has a member of this name.
+    """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, source in members:
             info = zipfile.ZipInfo(name)  # 1980-01-01
-            info.file_size = source.stat().st_size
-            with source.open("rb") as reader, archive.open(info, "w") as writer:
-                while piece := reader.read(1 << 22):
+            # Zip files write it first: it says whether the sizes need 64 bits.
+            info.file_size = (
+                source.size(name) if isinstance(source, ZipObjects) else source.stat().st_size
+            )
+            with archive.open(info, "w") as writer:
+                for piece in _pieces(name, source):
                     writer.write(piece)
+
+
+def _pieces(name: str, source: Path | ZipObjects) -> Iterator[bytes]:
+    """The bytes of a file or member, some at a time."""
+    if isinstance(source, ZipObjects):
+        for start in range(0, source.size(name), _PIECE_BYTES):
+            yield source.read(name, start, start + _PIECE_BYTES) or b""
+        return
+    with source.open("rb") as reader:
+        while piece := reader.read(_PIECE_BYTES):
+            yield piece
 
 
 def replace_file(path: Path, content: bytes, *, durable: bool = True) -> None:

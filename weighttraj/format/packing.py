@@ -96,8 +96,13 @@ def unpacked(path: Path) -> Iterator[Path]:
 def _members(folder: Path) -> Iterator[tuple[str, Path]]:
     """Files of a run in a fixed order, its metadata first."""
     files = {f.relative_to(folder).as_posix(): f for f in folder.rglob("*") if f.is_file()}
-    for name in sorted(files, key=lambda n: (n != "zarr.json", not n.endswith("zarr.json"), n)):
+    for name in sorted(files, key=packed_order):
         yield name, files[name]
+
+
+def packed_order(name: str) -> tuple[bool, bool, str]:
+    """Sorts the objects of a packed run: the metadata first, then the chunks by name."""
+    return name != "zarr.json", not name.endswith("zarr.json"), name
 
 
 def _equal(one: Path, other: Path) -> bool:
@@ -110,4 +115,4 @@ def _equal(one: Path, other: Path) -> bool:
     return True
 
 
-__all__ = ["pack", "same_as_packed", "unpacked"]
+__all__ = ["pack", "packed_order", "same_as_packed", "unpacked"]

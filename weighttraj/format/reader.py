@@ -16,7 +16,14 @@ from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.catalog import read_dataset_info
 from weighttraj.format.layout import ParamLayout
 from weighttraj.format.objects import FolderObjects
-from weighttraj.format.schema import ArraySpec, DatasetInfo, RunEntry, RunInfo
+from weighttraj.format.schema import (
+    RETURNS,
+    ArraySpec,
+    DatasetInfo,
+    Evaluation,
+    RunEntry,
+    RunInfo,
+)
 from weighttraj.format.storage import RunStore
 
 if TYPE_CHECKING:
@@ -238,6 +245,52 @@ class Run:
         finite = values[np.isfinite(values)]
         return float(finite[-1]) if len(finite) else float("nan")
 
+    @property
+    def evaluation(self) -> Evaluation | None:
+        """How the stored returns were got; None: no returns are stored."""
+        return self.info.evaluation
+
+    @property
+    def returns(self) -> StoredArray:
+        """Return of each episode that each snapshot played, float64 (time, episode).
+
+        ``run["eval/lengths"]``, int32, are its steps. NaN and -1: this snapshot was not evaluated.
+        NaN and a length: the simulation became unstable after so many steps.
+
+        Raises:
+            FormatError: no returns are stored.
+        """
+        self._evaluated()
+        return self[RETURNS[0]]
+
+    def mean_return(self, deterministic: bool = True) -> Float64[np.ndarray, " time"]:
+        """Mean return of each snapshot over the episodes of one mode.
+
+        NaN: the snapshot was not evaluated, or an episode has no return.
+
+        Args:
+            deterministic: of the episodes whose actions were the distribution's mode; else of
+                those whose actions were sampled.
+
+        Raises:
+            FormatError: no returns are stored, or of no such episode.
+        """
+        means: np.ndarray = self.returns[:, self._episodes(deterministic)].mean(axis=1)
+        return means
+
+    @property
+    def final_mean_return(self) -> float:
+        """Mean return of the last evaluated snapshot; NaN: none was, or it has no mean.
+
+        Of the deterministic episodes, if there are any, else of the sampled ones.
+        """
+        if self.evaluation is None:
+            return float("nan")
+        mode = any(self.evaluation.deterministic)
+        lengths = self[RETURNS[1]][:, self._episodes(mode)]
+        rows = np.flatnonzero((lengths >= 0).all(axis=1))
+        return float(self.mean_return(mode)[rows[-1]]) if rows.size else float("nan")
+
     def obs_norm(self, t: int) -> NormStats | None:
         """Statistics of the observation normaliser at snapshot t; None: the run has none."""
         return self._stats("obs_norm", t) if self.info.obs_norm is not None else None
@@ -255,6 +308,29 @@ class Run:
         from weighttraj.policies.policy import load_policy
 
         return load_policy(self, t)
+
+    def _evaluated(self) -> Evaluation:
+        if self.evaluation is None:
+            raise FormatError(
+                "the run stores no returns",
+                where=self.path,
+                do="weighttraj returns DATASET evaluates its snapshots and stores them",
+            )
+        return self.evaluation
+
+    def _episodes(self, deterministic: bool) -> list[int]:
+        """Columns of the episodes of one mode."""
+        modes = self._evaluated().deterministic
+        columns = [i for i, mode in enumerate(modes) if mode == deterministic]
+        if not columns:
+            raise FormatError(
+                "the returns are of no such episode",
+                expected="deterministic" if deterministic else "sampled",
+                got=f"{len(modes)} episodes, all {'sampled' if deterministic else 'deterministic'}",
+                where=self.path,
+                do=f"ask for mean_return(deterministic={not deterministic}), or evaluate again",
+            )
+        return columns
 
     def _stats(self, group: str, t: int) -> NormStats:
         mean, var, count = (self[f"{group}/{name}"][t] for name in ("mean", "var", "count"))
@@ -300,9 +376,9 @@ class Dataset:
 
         Args:
             wanted: ``env``, ``algorithm``, ``seed``, ``split``, ``status``, ``id``,
-                ``final_return`` or a hyper-parameter such as ``learning_rate``, each with the
-                value it must have, a collection it must be in, or a function that says whether
-                a value will do.
+                ``final_return``, ``final_mean_return`` or a hyper-parameter such as
+                ``learning_rate``, each with the value it must have, a collection it must be in,
+                or a function that says whether a value will do.
 
         >>> ds.select(env="InvertedPendulum-v4", seed=range(10))  # doctest: +SKIP
         >>> ds.select(final_return=lambda value: value > 900, n_epochs=10)  # doctest: +SKIP
@@ -411,6 +487,7 @@ def _facts(run: Run) -> dict[str, Any]:
         "env": info.env.id if info.env else None,
         "algorithm": info.algorithm.name if info.algorithm else None,
         "final_return": run.final_return,
+        "final_mean_return": run.final_mean_return,
     }
 
 

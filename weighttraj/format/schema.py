@@ -27,6 +27,7 @@ AXES: tuple[Axis, ...] = ("time", "iteration")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 _MAX_ROW = 2**31  # elements; beyond it a snapshot is taken for damaged metadata
 _MAX_COUNT = 2**48
+_MAX_EPISODES = 2**20
 _MAX_DEPTH = 64  # of JSON; what walks it may call itself so often
 
 
@@ -136,6 +137,44 @@ class Provenance:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """How the episodes were played whose returns stand under ``eval/``: one column an episode."""
+
+    seeds: tuple[int, ...]
+    """Seed of each episode's reset."""
+    deterministic: tuple[bool, ...]
+    """Of each episode: whether actions were the distribution's mode; else they were sampled."""
+    every: int = 1
+    """Returns were asked for of the snapshots 0, every, 2 * every and so on, and of the last."""
+    first: int = 0
+    """And of all of the first so many."""
+    normalizer: Literal["own", "final"] = "own"
+    """Whose statistics normalised observations: the snapshot's own, or those of the last one."""
+    simulator: str = ""
+    """What simulated: ``mujoco.batch``, ``gymnasium``; empty: not said."""
+    packages: dict[str, str] = field(default_factory=dict)
+    """Versions of each library that moves the numbers."""
+
+    def __post_init__(self) -> None:
+        n = len(self.seeds)
+        if n != len(self.deterministic) or not 1 <= n <= _MAX_EPISODES:
+            raise FormatError(
+                "an evaluation does not say of each episode how it was played",
+                expected="1 to 2**20 episodes, a seed and a mode for each",
+                got=f"{n} seeds, {len(self.deterministic)} modes",
+                do="give both, one for each column of the returns",
+            )
+        counts = (self.every - 1, self.first)
+        if min(*self.seeds, *counts) < 0 or max(counts) > _MAX_COUNT:
+            raise FormatError(
+                "a number of an evaluation is out of range",
+                expected="seeds at least 0, every 1 to 2**48, first 0 to 2**48",
+                got=f"smallest seed {min(self.seeds)}, every {self.every}, first {self.first}",
+                do="give the numbers that the episodes were played with",
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunInfo:
     """Everything about one run that is no array. Lives in the attributes of its Zarr group."""
 
@@ -167,6 +206,8 @@ class RunInfo:
     """Whether Adam's moments of the policy's parameters are stored."""
     probe_observations: int = 0
     """Network inputs kept an iteration; 0: none."""
+    evaluation: Evaluation | None = None
+    """How the stored returns were got, after the training; None: no returns are stored."""
     provenance: Provenance = Provenance()
     """Versions and machine."""
     block: int = 64
@@ -304,12 +345,17 @@ def arrays_of(info: RunInfo) -> dict[str, ArraySpec]:
         shape = info.policy.observation_shape
         inner, dims = (info.probe_observations, *shape), ("probe", *_observation_dims(shape))
         specs.append(_array("probe/observations", "float32", inner, *dims, axis="iteration"))
+    if info.evaluation is not None:
+        episodes = (len(info.evaluation.seeds),)
+        types = zip(RETURNS, ("float64", "int32"), strict=True)
+        specs += [_array(name, dtype, episodes, "episode") for name, dtype in types]
     return {spec.name: spec for spec in specs}
 
 
 INDEX_COUNTERS = ("iteration", "epoch", "gradient_step", "num_timesteps", "phase")
 MOMENTS = ("mean", "var")
 ADAM_MOMENTS = ("exp_avg", "exp_avg_sq")
+RETURNS = ("eval/returns", "eval/lengths")
 
 
 def _observation_dims(shape: tuple[int, ...]) -> tuple[str, ...]:

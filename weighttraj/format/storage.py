@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,8 @@ class Metadata:
     """Zarr metadata of each array."""
     tags: dict[str, str]
     """The crc32c of each chunk of each array: 8 digits a chunk, row by row of chunks."""
+    attributes: dict[str, Any] = field(default_factory=dict)
+    """The group's attributes as they were read, with what only a later version knows of."""
 
 
 class RunStore:
@@ -59,6 +61,7 @@ class RunStore:
         self.specs = arrays_of(metadata.info)
         self.documents = metadata.documents
         self.tags = metadata.tags
+        self.attributes = metadata.attributes
         self._decoders: dict[str, RowDecoder] = {}
 
     @property
@@ -200,7 +203,7 @@ def read_metadata(objects: Objects) -> Metadata:
                 where=f"{objects.path}, {name}",
                 do="restore the run from a copy",
             )
-    return Metadata(info=info, documents=documents, tags=tags)  # type: ignore[arg-type]
+    return Metadata(info=info, documents=documents, tags=tags, attributes=attributes)  # type: ignore[arg-type]
 
 
 def _array_documents(document: dict[str, Any], where: str) -> Documents:
@@ -236,12 +239,22 @@ def chunk_count(document: dict[str, Any]) -> int:
     return math.prod(-(-n // c) for n, c in zip(document["shape"], chunk, strict=True))
 
 
-def group_document(info: RunInfo, documents: Documents, tags: dict[str, str]) -> bytes:
-    """``zarr.json`` of a run's group, with the metadata of its arrays and the checksums."""
+def group_document(
+    info: RunInfo, documents: Documents, tags: dict[str, str], attributes: dict[str, Any]
+) -> bytes:
+    """``zarr.json`` of a run's group, with the metadata of its arrays and the checksums.
+
+    Args:
+        info: the run.
+        documents: Zarr metadata of each array.
+        tags: the crc32c of each chunk.
+        attributes: what the group had before; keys that this version does not know are kept.
+    """
+    own = attributes.get(ATTRIBUTE, {}) | to_json(info)
     document = {
         "zarr_format": 3,
         "node_type": "group",
-        "attributes": {ATTRIBUTE: to_json(info), TAGS: tags},
+        "attributes": attributes | {ATTRIBUTE: own, TAGS: tags},
         "consolidated_metadata": {
             "kind": "inline",
             "must_understand": False,

@@ -30,7 +30,12 @@ def write_tables(dataset: Dataset) -> None:
     except ModuleNotFoundError as error:
         raise missing_extra("pyarrow", "files") from error
     (dataset.path / "tables").mkdir(exist_ok=True)
-    _write(dataset.path / RUNS, pa.Table.from_pylist([run_row(run) for run in dataset]))
+    runs = pa.Table.from_pylist([run_row(run) for run in dataset])
+    if "final_mean_return" in runs.column_names:  # not a type of its own where all are null
+        index = runs.column_names.index("final_mean_return")
+        values = runs.column(index).cast(pa.float64())
+        runs = runs.set_column(index, "final_mean_return", values)
+    _write(dataset.path / RUNS, runs)
     parts = [pa.table(snapshot_columns(run)) for run in dataset]
     _write(dataset.path / SNAPSHOTS, pa.concat_tables(parts, promote_options="default"))
 
@@ -49,6 +54,7 @@ def run_row(run: Run) -> dict[str, Any]:
         "n_params": run.layout.size,
         "num_timesteps": int(run.num_timesteps[-1]) if len(run) else 0,
         "final_return": run.final_return,
+        "final_mean_return": None if np.isnan(run.final_mean_return) else run.final_mean_return,
         "created": info.provenance.created,
     }
     hyperparameters = info.algorithm.hyperparameters if info.algorithm else {}
@@ -57,7 +63,10 @@ def run_row(run: Run) -> dict[str, Any]:
 
 
 def snapshot_columns(run: Run) -> dict[str, Any]:
-    """What the table of snapshots says of a run: every array with one number a snapshot."""
+    """What the table of snapshots says of a run: every array with one number a snapshot.
+
+    Masked values are null in the table.
+    """
     weights = run.weights
     norms, steps, last = [], [], None
     for start in range(0, len(run), 512):
@@ -80,7 +89,16 @@ def snapshot_columns(run: Run) -> dict[str, Any]:
         **scalars,
         "weight_norm": np.concatenate(norms) if norms else np.zeros(0),
         "step_norm": np.concatenate(steps) if steps else np.zeros(0),
+        "mean_return_deterministic": _mean_returns(run, deterministic=True),
+        "mean_return_sampled": _mean_returns(run, deterministic=False),
     }
+
+
+def _mean_returns(run: Run, *, deterministic: bool) -> np.ma.MaskedArray[Any, Any]:
+    """Mean return of each snapshot over the episodes of a mode, masked where it has none."""
+    if run.evaluation is None or deterministic not in run.evaluation.deterministic:
+        return np.ma.masked_invalid(np.full(len(run), np.nan))
+    return np.ma.masked_invalid(run.mean_return(deterministic))
 
 
 def _write(path: Path, table: pa.Table) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -61,6 +61,7 @@ class RunWriter:
             if resume and path.exists():
                 self._store = _reopen(path, info)
             else:
+                info = replace(info, evaluation=None)  # of another run, if there is one
                 self._store = LiveStore.create(path, with_progress(info, **_NOTHING))
         except BaseException:
             self._lock.release()
@@ -246,7 +247,7 @@ class _Block:
 
 _NOTHING: dict[str, Any] = {"status": "collecting", "time": 0, "iteration": 0}
 _ADAM = ("optimizer/exp_avg", "optimizer/exp_avg_sq")
-_MAY_BE_NAN = ("train/", "index/learning_rate")
+_MAY_BE_NAN = ("train/", "index/learning_rate", "eval/")
 
 
 def lock_run(path: Path) -> FileLock:
@@ -289,7 +290,14 @@ def _reopen(path: Path, info: RunInfo) -> LiveStore:
     return store
 
 
-_MAY_DIFFER = ("status", "n_committed", "n_committed_iterations", "provenance", "profile")
+_MAY_DIFFER = (
+    "status",
+    "n_committed",
+    "n_committed_iterations",
+    "provenance",
+    "profile",
+    "evaluation",  # snapshots that are appended have no returns yet
+)
 
 
 def explain_difference(stored: Provenance, now: Provenance) -> str:
@@ -326,7 +334,9 @@ def _row(spec: ArraySpec, values: Mapping[str, Any]) -> np.ndarray:
             got=f"only {sorted(values)}",
             do="pass it to append",
         )
-    row = np.array(values.get(spec.name, spec.fill), spec.dtype)
+    if spec.name not in values:
+        return np.full(spec.inner, spec.fill, spec.dtype)
+    row = np.array(values[spec.name], spec.dtype)
     if row.shape != spec.inner:
         raise SnapshotError(
             "a value of the snapshot has the wrong shape",

@@ -17,7 +17,7 @@ from weighttraj.format import ParamLayout, PolicySpec, Run
 from weighttraj.format.reader import NormStats
 from weighttraj.format.schema import ObsNorm
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "": torch.nn.Identity(),
     "tanh": torch.tanh,
     "relu": functional.relu,
@@ -51,29 +51,11 @@ class Policy:
         obs_norm: ObsNorm | None = None,
         stats: NormStats | None = None,
     ) -> None:
-        if spec.kind != "mlp" or spec.activation not in _ACTIVATIONS or not spec.layers:
-            raise PolicyError(
-                "this policy cannot be rebuilt from its weights",
-                expected="a fully connected network on flat observations, with a Gaussian or "
-                f"categorical head and one of the activations {sorted(_ACTIVATIONS)}",
-                got="; ".join(spec.cannot_rebuild) or f"{spec.kind}, activation {spec.activation}",
-                do="rebuild it yourself from run.layout.unflatten(run.weights[t])",
-            )
         self.spec = spec
         self.layout = layout
         self.obs_norm, self.stats = obs_norm, stats
         self.weights = np.array(weights, np.float32)
-        tensors = {k: torch.from_numpy(v) for k, v in layout.unflatten(self.weights).items()}
-        try:
-            self._layers = [(tensors[weight], tensors[bias]) for weight, bias in spec.layers]
-            self._log_std = tensors["log_std"] if spec.head == "gaussian" else None
-        except KeyError as error:
-            raise PolicyError(
-                "the policy names a parameter that its layout lacks",
-                expected=[spec.name for spec in layout.params],
-                got=error,
-                do="restore the run's zarr.json from a copy",
-            ) from error
+        self._layers, self._log_std = network(spec, layout, self.weights)
 
     def with_weights(self, weights: Float32[np.ndarray, " param"]) -> Policy:
         """The same structure and normaliser with other weights, such as a forecast's."""
@@ -81,22 +63,15 @@ class Policy:
 
     def normalize(self, observation: np.ndarray) -> np.ndarray:
         """Network inputs, float32, for raw observations of any batch shape."""
-        norm, stats = self.obs_norm, self.stats
-        if norm is None or stats is None:
+        if self.stats is None:
             return np.asarray(observation, np.float32)
-        mean, var = (x.astype(norm.dtype) for x in (stats.mean, stats.var))
-        inputs = (observation - mean) / np.sqrt(var + norm.epsilon)
-        if norm.cast_before_clip:
-            inputs = np.float32(inputs)
-        if norm.clip_low is not None or norm.clip_high is not None:
-            inputs = np.clip(inputs, norm.clip_low, norm.clip_high)
-        return np.asarray(inputs, np.float32)
+        return normalize(observation, self.obs_norm, self.stats.mean, self.stats.var)
 
     @torch.no_grad()
     def distribution(self, inputs: Tensor) -> Normal | Categorical:
         """Distribution over unclipped actions for network inputs (batch, *observation)."""
         hidden = inputs.flatten(1)
-        activation = _ACTIVATIONS[self.spec.activation]
+        activation = ACTIVATIONS[self.spec.activation]
         for weight, bias in self._layers[:-1]:
             hidden = activation(functional.linear(hidden, weight, bias))
         outputs = functional.linear(hidden, *self._layers[-1])
@@ -143,19 +118,8 @@ class Policy:
     def _choose(self, distribution: Normal | Categorical, deterministic: bool) -> np.ndarray:
         if isinstance(distribution, Categorical):
             choice = distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call]
-            return self.to_actions(choice)
-        return self.to_actions(distribution.mean if deterministic else distribution.rsample())
-
-    def to_actions(self, values: Tensor) -> np.ndarray:
-        """Actions for the environment: shaped, and clipped to the action space."""
-        if self._log_std is None:
-            return values.numpy()
-        shape = self.spec.action_shape
-        low, high = (
-            np.array(x, np.float32).reshape(shape)
-            for x in (self.spec.action_low, self.spec.action_high)
-        )
-        return np.asarray(np.clip(values.numpy().reshape(-1, *shape), low, high))
+            return to_actions(self.spec, choice)
+        return to_actions(self.spec, distribution.mean if deterministic else distribution.rsample())
 
     def __repr__(self) -> str:
         units = [len(bias) for _, bias in self._layers]
@@ -171,3 +135,63 @@ def load_policy(run: Run, t: int = -1) -> Policy:
     """
     weights: Any = run.weights[t]
     return Policy(run.info.policy, run.layout, weights, run.info.obs_norm, run.obs_norm(t))
+
+
+def network(
+    spec: PolicySpec, layout: ParamLayout, weights: Float32[np.ndarray, "*policy param"]
+) -> tuple[list[tuple[Tensor, Tensor]], Tensor | None]:
+    """(weight, bias) of each layer, and ``log_std`` if the head is Gaussian; views of ``weights``.
+
+    Raises:
+        PolicyError: the spec describes no policy that can be rebuilt.
+    """
+    if spec.kind != "mlp" or spec.activation not in ACTIVATIONS or not spec.layers:
+        raise PolicyError(
+            "this policy cannot be rebuilt from its weights",
+            expected="a fully connected network on flat observations, with a Gaussian or "
+            f"categorical head and one of the activations {sorted(ACTIVATIONS)}",
+            got="; ".join(spec.cannot_rebuild) or f"{spec.kind}, activation {spec.activation}",
+            do="rebuild it yourself from run.layout.unflatten(run.weights[t])",
+        )
+    tensors = {name: torch.from_numpy(part) for name, part in layout.unflatten(weights).items()}
+    try:
+        layers = [(tensors[weight], tensors[bias]) for weight, bias in spec.layers]
+        return layers, tensors["log_std"] if spec.head == "gaussian" else None
+    except KeyError as error:
+        raise PolicyError(
+            "the policy names a parameter that its layout lacks",
+            expected=[spec.name for spec in layout.params],
+            got=error,
+            do="restore the run's zarr.json from a copy",
+        ) from error
+
+
+def normalize(
+    observation: np.ndarray, norm: ObsNorm | None, mean: np.ndarray, var: np.ndarray
+) -> np.ndarray:
+    """Network inputs, float32; mean and var are broadcast to the observations."""
+    if norm is None:
+        return np.asarray(observation, np.float32)
+    mean, var = mean.astype(norm.dtype), var.astype(norm.dtype)
+    inputs = (observation - mean) / np.sqrt(var + norm.epsilon)
+    if norm.cast_before_clip:
+        inputs = np.float32(inputs)
+    if norm.clip_low is not None or norm.clip_high is not None:
+        inputs = np.clip(inputs, norm.clip_low, norm.clip_high)
+    return np.asarray(inputs, np.float32)
+
+
+def to_actions(spec: PolicySpec, values: Tensor) -> np.ndarray:
+    """Actions for the environment (..., *action): shaped, and clipped to the action space.
+
+    Args:
+        spec: of the policy.
+        values: (..., action) of a Gaussian head, or (...) of a categorical one.
+    """
+    if spec.head != "gaussian":
+        return values.numpy()
+    low, high = (
+        np.array(x, np.float32).reshape(spec.action_shape)
+        for x in (spec.action_low, spec.action_high)
+    )
+    return np.asarray(np.clip(values.numpy().reshape(*values.shape[:-1], *low.shape), low, high))

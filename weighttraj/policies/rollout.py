@@ -1,87 +1,126 @@
-"""J(pi): the undiscounted return of a policy over fixed episodes."""
+"""J(pi): the undiscounted returns of policies over fixed episodes."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import gymnasium as gym
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
 
 from weighttraj import environments
 from weighttraj.errors import PolicyError
-from weighttraj.format import EnvInfo, Run
+from weighttraj.format import EnvInfo, PolicySpec, Run
+from weighttraj.policies.batch import PolicyBatch
 from weighttraj.policies.policy import Policy
+from weighttraj.policies.simulators import Simulator, make_simulator
+
+_BLOCK = 256
+"""Policies that play at once: enough for the physics to outweigh Python."""
+
+_NOISE_STEPS = 256
+"""Steps for which the noise of actions is drawn at a time."""
 
 
 class EpisodeReturns(NamedTuple):
-    """Outcome of some episodes."""
+    """Outcome of some episodes, (policy, episode), or (episode,) of a single policy."""
 
-    returns: Float64[np.ndarray, " episode"]
-    """Undiscounted sum of raw rewards."""
-    lengths: Int64[np.ndarray, " episode"]
-    """Environment steps."""
+    returns: np.ndarray
+    """float64: undiscounted sum of raw rewards; NaN: the simulation became unstable."""
+    lengths: np.ndarray
+    """int64: environment steps."""
 
 
 class Evaluator:
-    """Plays the same episodes with one policy after another.
+    """Plays the same episodes with every policy.
 
     Episode i starts from ``reset(seed=seed + i)`` and samples its actions with a generator of its
-    own, so two policies meet the same starts and the same noise, however many episodes there are.
-    (Actions are computed for all episodes at once: the last bit of an action may depend on how many
-    still run.) Raw observations and rewards: the policy brings its normaliser.
+    own, so all policies meet the same starts and the same noise. A policy's returns do not depend
+    on the policies beside it, nor on the number of threads. (The number of episodes may move the
+    last bit of an action: matrix products are ordered by their size.) Raw observations and rewards:
+    policies bring their normalisers.
+
+    Gymnasium's planar MuJoCo environments run as batched physics (``mujoco.batch``), bit by bit as
+    Gymnasium steps them. Any other environment runs in Gymnasium's own loop, 5 to 20 times slower;
+    ``simulator`` says which it is.
 
     Args:
         env: the environment, as a run describes it.
         episodes: number of episodes.
         seed: of the first episode.
+        threads: for physics and networks.
+        block: policies that play at once; memory grows with it.
 
     Raises:
         CollectError: the environment is not registered here.
         PolicyError: fewer than one episode.
     """
 
-    def __init__(self, env: EnvInfo, *, episodes: int = 20, seed: int = 0) -> None:
-        if episodes < 1:
-            raise PolicyError("no episodes to play", expected="at least 1", got=episodes)
-        self.seed = seed
-        limit = (
-            {} if env.max_episode_steps is None else {"max_episode_steps": env.max_episode_steps}
-        )
-        self._envs = [environments.make(env.id, **limit, **env.kwargs) for _ in range(episodes)]
+    def __init__(
+        self,
+        env: EnvInfo,
+        *,
+        episodes: int = 20,
+        seed: int = 0,
+        threads: int = 1,
+        block: int = _BLOCK,
+    ) -> None:
+        if min(episodes, threads, block) < 1:
+            raise PolicyError(
+                "no episodes to play, or nothing to play them with",
+                expected="episodes, threads and block at least 1",
+                got=f"episodes {episodes}, threads {threads}, block {block}",
+            )
+        self.seeds = list(range(seed, seed + episodes))
+        self._info, self._threads, self._block = env, threads, block
+        self._env = self._make()
+        self._noise: dict[tuple[str, int], list[np.ndarray]] = {}
 
-    def __call__(self, policy: Policy, *, deterministic: bool = True) -> EpisodeReturns:
+    @property
+    def simulator(self) -> str:
+        """What steps the environment: ``mujoco.batch`` or ``gymnasium``."""
+        return self._simulator.name
+
+    @overload
+    def __call__(self, policy: Policy, *, deterministic: bool = True) -> EpisodeReturns: ...
+    @overload
+    def __call__(self, policy: PolicyBatch, *, deterministic: bool = True) -> EpisodeReturns: ...
+    def __call__(
+        self, policy: Policy | PolicyBatch, *, deterministic: bool = True
+    ) -> EpisodeReturns:
         """Play every episode to its end.
+
+        Args:
+            policy: one policy, or many.
+            deterministic: act by the distribution's mode, else by samples.
+
+        Returns:
+            Returns and lengths, (policy, episode); of a single policy (episode,).
 
         Raises:
             PolicyError: the policy's observations or actions are not the environment's.
         """
-        envs = self._envs
-        _check_spaces(policy, envs[0])
-        observations = [env.reset(seed=self.seed + i)[0] for i, env in enumerate(envs)]
-        noise = [np.random.default_rng([self.seed + i, 1]) for i in range(len(envs))]
-        returns, lengths = np.zeros(len(envs)), np.zeros(len(envs), np.int64)
-        active = list(range(len(envs)))
-        while active:
-            raw = np.stack([observations[i] for i in active])
-            generators = None if deterministic else [noise[i] for i in active]
-            actions = _act(policy, raw, generators)
-            still = []
-            for i, action in zip(active, actions, strict=True):
-                observations[i], reward, terminated, truncated, _ = envs[i].step(action)
-                returns[i] += float(reward)
-                lengths[i] += 1
-                if not (terminated or truncated):
-                    still.append(i)
-            active = still
+        _check_spaces(policy.spec, self._env)
+        if isinstance(policy, Policy):
+            returns, lengths = self(_batch_of(policy), deterministic=deterministic)
+            return EpisodeReturns(returns[0], lengths[0])
+        most = min(self._block, self._simulator.most or self._block)
+        with _torch_threads(self._threads), environments.quiet_mujoco():
+            blocks = [
+                self._play(policy[start : start + most], deterministic)
+                for start in range(0, len(policy), most)
+            ]
+        returns, lengths = (np.concatenate(x) for x in zip(*blocks, strict=True))
         return EpisodeReturns(returns, lengths)
 
     def close(self) -> None:
         """Close the environments."""
-        for env in self._envs:
-            env.close()
+        self._simulator.close()
+        self._env.close()
 
     def __enter__(self) -> Evaluator:
         return self
@@ -94,23 +133,78 @@ class Evaluator:
     ) -> None:
         self.close()
 
+    @cached_property
+    def _simulator(self) -> Simulator:
+        return make_simulator(self._make, self.seeds, threads=self._threads)
+
+    def _make(self) -> gym.Env[Any, Any]:
+        limit = self._info.max_episode_steps
+        limits = {} if limit is None else {"max_episode_steps": limit}
+        return environments.make(self._info.id, **limits, **self._info.kwargs)
+
+    def _play(self, policies: PolicyBatch, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Returns and lengths (policy, episode) of a block of policies."""
+        shape = (len(policies), len(self.seeds))
+        returns, lengths = np.zeros(shape), np.zeros(shape, np.int64)
+        first = self._simulator.reset(len(policies))
+        observations = first.reshape(*shape, *first.shape[1:])
+        sims = np.arange(returns.size).reshape(shape)
+        running = np.ones(shape, bool)
+        limit = getattr(self._env.spec, "max_episode_steps", None)
+        step = 0
+        while running.any() and step != limit:
+            if 2 * running.any(1).sum() <= len(policies):  # policies whose episodes are over leave
+                keep = np.flatnonzero(running.any(1))
+                policies = policies[keep]
+                observations, sims, running = observations[keep], sims[keep], running[keep]
+            noise = None if deterministic else self._noise_at(step, policies.spec)
+            actions = policies.act(observations, noise)
+            playing = sims[running]
+            result = self._simulator.step(playing, actions[running])
+            step += 1
+            observations[running] = result.observations
+            returns.flat[playing] += np.where(result.unstable, np.nan, result.rewards)
+            lengths.flat[playing] = step
+            running[running] = ~(result.terminated | result.truncated | result.unstable)
+        return returns, lengths
+
+    def _noise_at(self, step: int, spec: PolicySpec) -> np.ndarray:
+        """What chance adds to the actions of a step, (episode, ...): the same for all policies."""
+        size = max(1, len(spec.action_low))
+        drawn = self._noise.setdefault((spec.head, size), [])
+        while step >= len(drawn) * _NOISE_STEPS:
+            drawn.append(np.stack([self._draw(seed, len(drawn), spec) for seed in self.seeds], 1))
+        return np.asarray(drawn[step // _NOISE_STEPS][step % _NOISE_STEPS])
+
+    @staticmethod
+    def _draw(seed: int, part: int, spec: PolicySpec) -> np.ndarray:
+        """One part of an episode's noise, (step, ...)."""
+        generator = np.random.default_rng([seed, 1])
+        size = len(spec.action_low)
+        shape = (part + 1, _NOISE_STEPS, size) if size else (part + 1, _NOISE_STEPS)
+        if spec.head == "gaussian":
+            return np.asarray(generator.standard_normal(shape, np.float32)[part])
+        return np.asarray(generator.random(shape)[part])
+
 
 def evaluate(
-    policy: Policy,
+    policy: Policy | PolicyBatch,
     env: EnvInfo | Run | str,
     *,
     episodes: int = 20,
     seed: int = 0,
     deterministic: bool = True,
+    threads: int = 1,
 ) -> EpisodeReturns:
-    """Returns of a policy over fixed episode seeds.
+    """Returns of a policy, or of many, over fixed episode seeds.
 
     Args:
-        policy: from ``run.load_policy(t)``.
+        policy: from ``run.load_policy(t)``, or ``load_policies(run, rows)``.
         env: the environment, its id, or a run that was trained in it.
         episodes: number of episodes.
         seed: of the first episode; episode i starts from ``seed + i``.
         deterministic: act by the distribution's mode, else by samples.
+        threads: for physics and networks.
 
     Raises:
         PolicyError: the run does not say which environment it was trained in.
@@ -119,7 +213,7 @@ def evaluate(
         env = env_of(env)
     elif isinstance(env, str):
         env = EnvInfo(id=env)
-    with Evaluator(env, episodes=episodes, seed=seed) as evaluator:
+    with Evaluator(env, episodes=episodes, seed=seed, threads=threads) as evaluator:
         return evaluator(policy, deterministic=deterministic)
 
 
@@ -146,9 +240,8 @@ def env_of(run: Run) -> EnvInfo:
     return run.info.env
 
 
-def _check_spaces(policy: Policy, env: gym.Env[Any, Any]) -> None:
+def _check_spaces(spec: PolicySpec, env: gym.Env[Any, Any]) -> None:
     observed, acted = env.observation_space, env.action_space
-    spec = policy.spec
     kind = gym.spaces.Box if spec.head == "gaussian" else gym.spaces.Discrete
     fits = isinstance(acted, kind) and acted.shape == spec.action_shape
     if observed.shape != spec.observation_shape or not fits:
@@ -162,16 +255,17 @@ def _check_spaces(policy: Policy, env: gym.Env[Any, Any]) -> None:
         )
 
 
-def _act(policy: Policy, raw: np.ndarray, noise: list[np.random.Generator] | None) -> np.ndarray:
-    """Actions (batch, *action) for raw observations; noise None: the mode."""
-    if noise is None:
-        return policy.predict(raw, deterministic=True)[0]
-    distribution = policy.distribution(torch.from_numpy(policy.normalize(raw)))
-    if isinstance(distribution, torch.distributions.Categorical):
-        uniform = torch.tensor([g.random() for g in noise])[:, None]
-        cumulative = distribution.probs.double().cumsum(1)
-        choice = (uniform > cumulative).sum(1).clamp(max=cumulative.shape[1] - 1)
-        return policy.to_actions(choice)
-    size = distribution.mean.shape[1]
-    normal = np.stack([g.standard_normal(size, np.float32) for g in noise])
-    return policy.to_actions(distribution.mean + distribution.stddev * torch.from_numpy(normal))
+def _batch_of(policy: Policy) -> PolicyBatch:
+    stats = policy.stats
+    mean, var = (None, None) if stats is None else (stats.mean[None], stats.var[None])
+    return PolicyBatch(policy.spec, policy.layout, policy.weights[None], policy.obs_norm, mean, var)
+
+
+@contextmanager
+def _torch_threads(threads: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,247 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+import weighttraj as wt
+from weighttraj.errors import FormatError, PolicyError, StoreLockedError
+from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
+from weighttraj.policies.returns import play_rows
+
+CONFIG = ReturnsConfig(episodes=2, every=20, first=3)
+ROWS = [0, 1, 2, 20, 40, 48]
+
+
+@pytest.fixture
+def dataset(small_dataset: Path, tmp_path: Path) -> Path:
+    """A copy that may be written to."""
+    return Path(shutil.copytree(small_dataset, tmp_path / "small"))
+
+
+def stored(path: Path) -> dict[str, tuple[list[float], list[int]]]:
+    """What the runs of a data set hold, in a form that can be compared."""
+    return {
+        run.id: (
+            np.nan_to_num(run["eval/returns"][:], nan=-1).tolist(),
+            run["eval/lengths"][:].tolist(),
+        )
+        for run in wt.open(path)
+    }
+
+
+def test_returns_of_every_kth_snapshot_are_stored(dataset: Path) -> None:
+    before = {run.id: run.weights[:] for run in wt.open(dataset)}
+    filled = fill_returns(dataset, CONFIG)
+    for run in filled:
+        lengths, evaluation = run["eval/lengths"][:], run.evaluation
+        assert np.flatnonzero((lengths != -1).any(1)).tolist() == ROWS
+        assert evaluation is not None
+        assert evaluation.seeds == (0, 1, 0, 1)
+        assert evaluation.deterministic == (True, True, False, False)
+        assert (evaluation.every, evaluation.first) == (20, 3)
+        assert evaluation.simulator == "mujoco.batch"
+        assert evaluation.packages.keys() == {"gymnasium", "mujoco", "numpy", "torch"}
+        for t in (1, 40):
+            played = [
+                evaluate(run.load_policy(t), run, episodes=2, deterministic=m)
+                for m in (True, False)
+            ]
+            assert run.returns[t].tolist() == [*played[0].returns, *played[1].returns]
+            assert lengths[t].tolist() == [*played[0].lengths, *played[1].lengths]
+        assert np.array_equal(run.weights[:], before[run.id])
+    assert wt.verify(dataset, deep=True) == []
+    assert not (dataset / ".returns").exists()
+
+
+def test_a_run_that_was_replaced_says_so(dataset: Path) -> None:
+    before = wt.open(dataset).runs[0]
+    assert before.weights.shape == (49, 122)
+    fill_returns(dataset, CONFIG)
+    with pytest.raises(FormatError, match=r"(?s)replaced after it was opened.*open it again"):
+        before.weights[:]
+
+
+def test_what_is_stored_is_not_played_again(dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill_returns(dataset, CONFIG)
+    objects = {p: p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
+    played = []
+    monkeypatch.setattr(returns, "play_rows", lambda task: played.append(task))
+    fill_returns(dataset, CONFIG)
+    assert played == []
+    assert {p: p.read_bytes() for p in dataset.rglob("*") if p.is_file()} == objects
+
+
+def test_more_snapshots_of_the_same_episodes_are_added(dataset: Path, small_dataset: Path) -> None:
+    fill_returns(dataset, CONFIG)
+    fill_returns(dataset, ReturnsConfig(episodes=2, every=16))
+    run = wt.open(dataset).runs[0]
+    assert np.flatnonzero(run["eval/lengths"][:, 0] != -1).tolist() == [0, 1, 2, 16, 20, 32, 40, 48]
+    fresh = evaluate(run.load_policy(20), run, episodes=2)
+    assert run.returns[20, :2].tolist() == fresh.returns.tolist()
+
+
+def test_two_processes_give_what_one_gives(
+    dataset: Path, small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(returns, "BLOCK", 2)
+    fill_returns(dataset, CONFIG, workers=2)
+    other = Path(shutil.copytree(small_dataset, tmp_path / "other" / "small"))
+    monkeypatch.setattr(returns, "BLOCK", 5)
+    fill_returns(other, CONFIG)
+    assert stored(dataset) == stored(other)
+    assert _bytes(dataset) == _bytes(other)
+
+
+def _bytes(path: Path) -> dict[str, bytes]:
+    files = sorted(p for p in path.rglob("*") if p.is_file() and not p.name.endswith(".lock"))
+    return {p.relative_to(path).as_posix(): p.read_bytes() for p in files}
+
+
+COMMAND = """
+import sys, weighttraj.policies.returns as returns
+returns.BLOCK = 1
+config = returns.ReturnsConfig(episodes=40, every=4)
+if __name__ == "__main__":
+    returns.fill_returns(sys.argv[1], config, workers=int(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize(("workers", "kind"), [(1, signal.SIGKILL), (2, signal.SIGINT)])
+def test_killed_it_goes_on(
+    dataset: Path, small_dataset: Path, tmp_path: Path, workers: int, kind: int
+) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, str(dataset), str(workers)],
+        start_new_session=True,
+    )
+    journals, lines = dataset / ".returns", 0
+    while lines < 3:  # the header and two snapshots
+        assert process.poll() is None
+        time.sleep(0.01)
+        lines = max((p.read_text().count("\n") for p in journals.glob("*.jsonl")), default=0)
+    os.killpg(process.pid, kind)
+    assert process.wait(timeout=30) != 0
+    left = sum(p.read_text().count("\n") for p in journals.glob("*.jsonl"))
+    assert left >= 3
+    assert wt.open(dataset).runs[0].weights.shape == (49, 122)
+    assert any("manifest" in problem for problem in wt.verify(dataset))
+    config = ReturnsConfig(episodes=40, every=4)
+    fill_returns(dataset, config)
+    other = Path(shutil.copytree(small_dataset, tmp_path / "other" / "small"))
+    fill_returns(other, config)
+    assert _bytes(dataset) == _bytes(other)
+    assert wt.verify(dataset, deep=True) == []
+
+
+def test_a_journal_that_was_cut_short_is_used_as_far_as_it_goes(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(returns, "BLOCK", 2)
+    _stop_after(monkeypatch, 2)
+    with pytest.raises(KeyboardInterrupt):
+        fill_returns(dataset, CONFIG)
+    journal = dataset / ".returns" / "seed0000.jsonl"
+    assert [json.loads(line)["t"] for line in journal.read_text().split("\n")[1:5]] == ROWS[:4]
+    journal.write_bytes(journal.read_bytes()[:-3])
+    played = _count(monkeypatch)
+    fill_returns(dataset, CONFIG)
+    assert played[:2] == [ROWS[3:5], ROWS[5:]]
+    assert wt.verify(dataset) == []
+
+
+def test_a_journal_of_other_settings_is_not_used(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(returns, "BLOCK", 5)
+    _stop_after(monkeypatch, 1)
+    with pytest.raises(KeyboardInterrupt):
+        fill_returns(dataset, CONFIG)
+    played = _count(monkeypatch)
+    fill_returns(dataset, ReturnsConfig(episodes=2, every=20, first=3, seed=7))
+    assert played == [ROWS[:5], ROWS[5:]] * 4
+    assert wt.open(dataset).runs[0].evaluation.seeds == (7, 8, 7, 8)  # type: ignore[union-attr]
+
+
+def _count(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
+    """The snapshots of each block that is played from now on."""
+    played: list[list[int]] = []
+
+    def play(task: returns._Task) -> EpisodeReturns:
+        played.append(task.rows)
+        return play_rows(task)
+
+    monkeypatch.setattr(returns, "play_rows", play)
+    return played
+
+
+def _stop_after(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
+    """Ctrl-C when so many blocks have been played."""
+    played = _count(monkeypatch)
+    count = returns.play_rows
+
+    def play(task: returns._Task) -> EpisodeReturns:
+        if len(played) == blocks:
+            raise KeyboardInterrupt
+        return count(task)
+
+    monkeypatch.setattr(returns, "play_rows", play)
+
+
+def test_another_evaluation_is_refused_or_replaces(dataset: Path) -> None:
+    fill_returns(dataset, CONFIG)
+    other = ReturnsConfig(episodes=2, every=40, modes=("sampled",))
+    with pytest.raises(
+        PolicyError, match=r"(?s)returns of another evaluation.*deterministic.*--replace"
+    ):
+        fill_returns(dataset, other)
+    assert wt.verify(dataset) == []
+    run = fill_returns(dataset, other, replace=True).runs[0]
+    assert run.returns.shape == (49, 2)
+    assert np.flatnonzero(run["eval/lengths"][:, 0] != -1).tolist() == [0, 40, 48]
+    assert wt.verify(dataset, deep=True) == []
+
+
+def test_returns_of_other_physics_are_not_mixed(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill_returns(dataset, CONFIG)
+    real = returns.importlib.metadata.version
+    monkeypatch.setattr(
+        returns.importlib.metadata,
+        "version",
+        lambda name: "9.9" if name == "mujoco" else real(name),
+    )
+    with pytest.raises(PolicyError, match=r"(?s)another evaluation.*another mujoco"):
+        fill_returns(dataset, ReturnsConfig(episodes=2, every=7))
+
+
+def test_only_one_at_a_time(dataset: Path) -> None:
+    with (
+        FileLock(dataset.parent / ".small.lock"),
+        pytest.raises(StoreLockedError, match="another process is changing"),
+    ):
+        fill_returns(dataset, CONFIG)
+
+
+def test_settings_that_evaluate_nothing_are_refused(dataset: Path) -> None:
+    for wrong in ({"episodes": 0}, {"every": 0}, {"first": -1}, {"modes": ()}, {"seed": -1}):
+        with pytest.raises(PolicyError, match="evaluate nothing"):
+            ReturnsConfig(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(PolicyError, match="workers at least 1"):
+        fill_returns(dataset, CONFIG, workers=0)
+
+
+def test_every_kth_the_first_and_the_last() -> None:
+    assert ReturnsConfig(every=10, first=4).rows(33) == [0, 1, 2, 3, 10, 20, 30, 32]
+    assert ReturnsConfig(every=10, first=100).rows(3) == [0, 1, 2]
+    assert ReturnsConfig(every=3).rows(0) == []

@@ -1,0 +1,376 @@
+"""Fills ``eval/returns`` and ``eval/lengths`` of the runs of a data set, and goes on when stopped.
+
+Each block of snapshots that has been played is written to a journal, one line a snapshot, in the
+hidden folder ``.returns`` of the data set. When all snapshots of a run are played, the run gets its
+arrays and the journal goes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from filelock import FileLock, Timeout
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from weighttraj.errors import PolicyError, StoreLockedError
+from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, store_returns
+from weighttraj.format.catalog import MANIFEST
+from weighttraj.format.integrity import seal, unseal
+from weighttraj.format.objects import replace_file
+from weighttraj.policies.batch import load_policies
+from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
+from weighttraj.policies.simulators import GymnasiumSimulator
+
+Mode = Literal["deterministic", "sampled"]
+
+BLOCK = 32
+"""Snapshots that are played, and written to the journal, at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReturnsConfig:
+    """Which snapshots are evaluated, and in which episodes."""
+
+    episodes: int = 10
+    """Episodes for each action mode; episode i starts from reset(seed=seed + i)."""
+    every: int = 10
+    """Every how many snapshots; the last one is always evaluated."""
+    first: int = 0
+    """And all of the first so many: policies change most at the start."""
+    modes: tuple[Mode, ...] = ("deterministic", "sampled")
+    """Actions: the distribution's mode, samples, or both."""
+    seed: int = 0
+    """Seed of the first episode."""
+
+    def __post_init__(self) -> None:
+        wrong = min(self.episodes, self.every, self.first + 1, self.seed + 1) < 1
+        if wrong or not self.modes or len(set(self.modes)) < len(self.modes):
+            raise PolicyError(
+                "these settings evaluate nothing",
+                expected="episodes and every at least 1, first and seed at least 0, "
+                "one or two different modes",
+                got=self,
+            )
+
+    def rows(self, snapshots: int) -> list[int]:
+        """The snapshots to be evaluated of a run that has so many."""
+        chosen = {*range(0, snapshots, self.every), *range(min(self.first, snapshots))}
+        return sorted(chosen | {snapshots - 1}) if snapshots else []
+
+    def evaluation(self, simulator: str) -> Evaluation:
+        """What the run's metadata say of it."""
+        seeds = tuple(range(self.seed, self.seed + self.episodes))
+        return Evaluation(
+            seeds=seeds * len(self.modes),
+            deterministic=tuple(mode == "deterministic" for mode in self.modes for _ in seeds),
+            every=self.every,
+            first=self.first,
+            simulator=simulator,
+            packages={
+                name: importlib.metadata.version(name)
+                for name in ("gymnasium", "mujoco", "numpy", "torch")
+            },
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """Snapshots of one run to be played."""
+
+    path: Path
+    rows: list[int]
+    config: ReturnsConfig
+
+
+def fill_returns(
+    path: str | Path,
+    config: ReturnsConfig | None = None,
+    *,
+    workers: int = 1,
+    replace: bool = False,
+    console: Console | None = None,
+) -> Dataset:
+    """Evaluate stored policies and store their returns in the runs of a data set.
+
+    What is stored already, or was played before an interruption, is not played again. Runs that are
+    still being collected are left for later. The result does not depend on the number of workers.
+
+    Args:
+        path: data set.
+        config: which snapshots and episodes; None: the defaults.
+        workers: processes; 1 means this one.
+        replace: drop returns of another evaluation (other episodes, versions of the physics).
+        console: where progress is shown; None: nowhere.
+
+    Returns:
+        The data set, opened again.
+
+    Raises:
+        PolicyError: a run has returns of another evaluation, or cannot be evaluated.
+        StoreLockedError: somebody else is doing the same.
+        KeyboardInterrupt: it was stopped; what was played stays.
+    """
+    path, config = Path(path), config or ReturnsConfig()
+    console = console or Console(quiet=True)
+    if workers < 1:
+        raise PolicyError("nobody to do the work", expected="workers at least 1", got=workers)
+    with _only_one(path):
+        runs = _finished(open_dataset(path), console)
+        works = [_Work(run, path / ".returns", config, replace=replace) for run in runs]
+        works = [work for work in works if work.missing or work.unsaved]
+        if works:
+            unseal(path)
+        _play(works, workers, console)
+        # Also when a run got its returns before a kill, and the tables did not.
+        if open_dataset(path).info.status == "complete" and not (path / MANIFEST).is_file():
+            seal(path)
+    return open_dataset(path)
+
+
+_SAME = ("seeds", "deterministic", "normalizer", "simulator")
+"""What must be equal for returns of two evaluations to stand in one array."""
+
+_Played = dict[int, tuple[np.ndarray, np.ndarray]]
+"""Returns and lengths, each (episode,), by snapshot."""
+
+
+class _Work:
+    """What is still to be done for one run.
+
+    Args:
+        run: the run.
+        folder: of the journals.
+        config: the settings.
+        replace: forget returns of another evaluation.
+    """
+
+    def __init__(self, run: Run, folder: Path, config: ReturnsConfig, *, replace: bool) -> None:
+        self.run, self.config = run, config
+        with Evaluator(env_of(run), episodes=1) as evaluator:
+            self.evaluation = config.evaluation(evaluator.simulator)
+        self._journal = _Journal(folder / f"{run.id}.jsonl", self._header())
+        self.played = self._stored(replace=replace) | self._journal.rows
+        self.unsaved = len(self._journal.rows)
+        self.missing = [row for row in config.rows(len(run)) if row not in self.played]
+
+    def begin(self) -> None:
+        """Begin the journal; store what an earlier one holds, if that is all."""
+        self._journal.begin()
+        if not self.missing:
+            self.save()
+
+    def tasks(self) -> Iterator[_Task]:
+        """The missing snapshots in blocks."""
+        for start in range(0, len(self.missing), BLOCK):
+            rows = self.missing[start : start + BLOCK]
+            yield _Task(path=self.run.path, rows=rows, config=self.config)
+
+    def add(self, rows: list[int], played: EpisodeReturns) -> None:
+        """Keep the outcome of a block; store everything in the run if it was the last."""
+        new = {row: (played.returns[i], played.lengths[i]) for i, row in enumerate(rows)}
+        self._journal.append(new)
+        self.played |= new
+        if all(row in self.played for row in self.missing):
+            self.save()
+
+    def save(self) -> None:
+        """Store what was played in the run."""
+        shape = (len(self.run), len(self.evaluation.seeds))
+        returns, lengths = np.full(shape, np.nan), np.full(shape, -1, np.int64)
+        for row, (row_returns, row_lengths) in self.played.items():
+            returns[row], lengths[row] = row_returns, row_lengths
+        store_returns(self.run.path, self.evaluation, returns, lengths)
+        self._journal.remove()
+
+    def _stored(self, *, replace: bool) -> _Played:
+        before = self.run.info.evaluation
+        if before is None:
+            return {}
+        differs = [
+            name for name in _SAME if getattr(before, name) != getattr(self.evaluation, name)
+        ]
+        physics = ("mujoco", "gymnasium")
+        differs += [p for p in physics if before.packages.get(p) != self.evaluation.packages[p]]
+        if differs and replace:
+            return {}
+        if differs:
+            raise PolicyError(
+                "the run has returns of another evaluation",
+                expected=f"the same {', '.join(_SAME)}, and versions of {' and '.join(physics)}",
+                got=f"another {', '.join(differs)}: {before}",
+                where=self.run.path,
+                do="give the settings that it was evaluated with, or replace=True (--replace) "
+                "to evaluate it anew",
+            )
+        returns, lengths = self.run["eval/returns"][:], self.run["eval/lengths"][:]
+        known = np.flatnonzero((lengths != -1).all(1))
+        return {int(row): (returns[row], lengths[row]) for row in known}
+
+    def _header(self) -> dict[str, Any]:
+        """What a journal must begin with to be of this run and these settings."""
+        digest = self.run["digest"][-1].tobytes().hex() if len(self.run) else ""
+        told = asdict(self.evaluation) | {"digest": digest, "snapshots": len(self.run)}
+        header: dict[str, Any] = json.loads(json.dumps(told | {"every": None, "first": None}))
+        return header
+
+
+class _Journal:
+    """Snapshots that were played, one JSON line each; a line that a kill cut short is dropped.
+
+    Args:
+        path: the file.
+        header: its first line; a journal with another one is begun anew.
+    """
+
+    def __init__(self, path: Path, header: dict[str, Any]) -> None:
+        self._path, self._header = path, header
+        self.rows = self._read(header)
+
+    def begin(self) -> None:
+        """Write it anew with the lines that hold."""
+        self._path.parent.mkdir(exist_ok=True)
+        replace_file(self._path, f"{json.dumps(self._header)}\n".encode())
+        self.append(self.rows)
+
+    def _read(self, header: dict[str, Any]) -> _Played:
+        if not self._path.is_file():
+            return {}
+        rows: _Played = {}
+        lines = self._path.read_text(errors="replace").split("\n")[:-1]
+        with contextlib.suppress(ValueError):  # what follows a damaged line is played again
+            if not lines or json.loads(lines[0]) != header:
+                return {}
+            for line in lines[1:]:
+                entry = json.loads(line)
+                returns = np.array([np.nan if x is None else x for x in entry["returns"]])
+                rows[entry["t"]] = (returns, np.array(entry["lengths"], np.int64))
+        return rows
+
+    def append(self, rows: _Played) -> None:
+        """Write lines; when this returns they survive a power cut."""
+        with self._path.open("a") as file:
+            for row, (returns, lengths) in rows.items():
+                numbers = [None if np.isnan(x) else float(x) for x in returns]
+                entry = {"t": row, "returns": numbers, "lengths": lengths.tolist()}
+                file.write(json.dumps(entry) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def remove(self) -> None:
+        """Remove it, and the folder if no other journal is in it."""
+        self._path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self._path.parent.rmdir()
+
+
+def _finished(dataset: Dataset, console: Console) -> list[Run]:
+    done = [run for run in dataset if run.info.status != "collecting"]
+    if skipped := [run.id for run in dataset if run not in done]:
+        console.print(f"still being collected, so left for later: {', '.join(skipped)}")
+    return done
+
+
+def _play(works: Sequence[_Work], workers: int, console: Console) -> None:
+    """Play all tasks of all runs."""
+    if slow := sorted({env_of(work.run).id for work in works if _is_slow(work)}):
+        console.print(f"{', '.join(slow)}: no batched physics, so Gymnasium's own loop, slowly")
+    for work in works:
+        work.begin()
+    tasks = [(work, task) for work in works for task in work.tasks()]
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("policies,"),
+        TimeElapsedColumn(),
+        TextColumn("so far,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("returns", total=sum(len(task.rows) for _, task in tasks))
+        for work, task, played in _outcomes(tasks, workers):
+            work.add(task.rows, played)
+            progress.advance(bar, len(task.rows))
+
+
+def _is_slow(work: _Work) -> bool:
+    return work.evaluation.simulator == GymnasiumSimulator.name
+
+
+def _outcomes(
+    tasks: Sequence[tuple[_Work, _Task]], workers: int
+) -> Iterator[tuple[_Work, _Task, EpisodeReturns]]:
+    if workers == 1 or len(tasks) < 2:
+        for work, task in tasks:
+            yield work, task, play_rows(task)
+        return
+    before = multiprocessing.active_children()
+    pool = ProcessPoolExecutor(
+        min(workers, len(tasks)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
+    try:
+        futures: dict[Future[EpisodeReturns], tuple[_Work, _Task]] = {
+            pool.submit(play_rows, task): (work, task) for work, task in tasks
+        }
+        for future in as_completed(futures):
+            yield *futures[future], future.result()
+        pool.shutdown()
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            if process not in before:  # they write nothing, so nothing is lost
+                process.terminate()
+        raise
+
+
+def play_rows(task: _Task) -> EpisodeReturns:
+    """Returns and lengths (snapshot, episode) of some snapshots, both modes side by side."""
+    run, config = open_run(task.path), task.config
+    policies = load_policies(run, task.rows)
+    with Evaluator(env_of(run), episodes=config.episodes, seed=config.seed) as evaluator:
+        played = [evaluator(policies, deterministic=m == "deterministic") for m in config.modes]
+    returns, lengths = (np.concatenate(parts, axis=1) for parts in zip(*played, strict=True))
+    return EpisodeReturns(returns, lengths)
+
+
+@contextlib.contextmanager
+def _only_one(path: Path) -> Iterator[None]:
+    lock = FileLock(path.with_name(f".{path.name}.lock"))  # as who collects into it
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise StoreLockedError(
+            "another process is changing this data set",
+            where=path,
+            do="wait for its collection or evaluation to end, or stop it",
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+__all__ = ["ReturnsConfig", "fill_returns", "play_rows"]
