@@ -65,8 +65,8 @@ def render(results: dict[str, Any]) -> str:
 def _returns(row: dict[str, Any]) -> str:
     units = "x".join(map(str, row["units"]))
     return (
-        f"Returns of {row['policies']} policies x {row['episodes']} episodes, {row['env']} {units}: "
-        f"{row['over_sb3']:.1f} times as fast as `evaluate_policy` one after another, "
+        f"Returns of {row['policies']} policies x {row['episodes']} episodes, {row['env']} "
+        f"{units}: {row['over_sb3']:.1f} times as fast as `evaluate_policy` one after another, "
         f"{row['over_limit']:.2f} of the speed of the bare physics; two threads "
         f"{row['two_threads']:.1f} times as fast as one."
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import weakref
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,18 +16,13 @@ from weighttraj.collect.describe import (
     actor_parameters,
     check_model,
     critic_parameters,
-    describe_algorithm,
-    describe_cadence,
-    describe_env,
-    describe_layout,
-    describe_policy,
-    describe_provenance,
+    describe_run,
 )
-from weighttraj.collect.normalizers import Normalizers, find_normalizers
+from weighttraj.collect.normalizers import find_normalizers
+from weighttraj.collect.recorder import Reading, Recorder
 from weighttraj.errors import CollectError
-from weighttraj.format import RunInfo, RunWriter
+from weighttraj.format import RunWriter
 from weighttraj.format.schema import Status
-from weighttraj.format.writer import check_finite
 
 
 class WeightTrajectoryCallback(BaseCallback):
@@ -90,8 +84,7 @@ class WeightTrajectoryCallback(BaseCallback):
         self.block = block
         self.resume = resume
         self._algorithm: OnPolicyAlgorithm
-        self._writer: RunWriter | None = None
-        self._closed = False
+        self._recorder: Recorder | None = None
 
     @property
     def writer(self) -> RunWriter:
@@ -100,23 +93,13 @@ class WeightTrajectoryCallback(BaseCallback):
         Raises:
             CollectError: it has not.
         """
-        if self._writer is None:
-            raise CollectError(
-                "nothing is recorded before training starts",
-                where=self.path,
-                do="pass the callback to model.learn(..., callback=...)",
-            )
-        return self._writer
+        return self._recording.writer
 
     def close(self, status: Status = "crashed") -> None:
         """Commit what is left and stop recording. Does nothing after training has ended well."""
-        if self._writer is not None and not self._closed:
-            self._closed = True
+        if self._recorder is not None:
             self._hook.remove()
-            try:
-                self._append_pending()
-            finally:
-                self._writer.close(status)
+            self._recorder.close(status)
 
     def __enter__(self) -> WeightTrajectoryCallback:
         return self
@@ -126,7 +109,7 @@ class WeightTrajectoryCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._algorithm = model = check_model(self.model)
-        if self._writer is not None:
+        if self._recorder is not None:
             raise CollectError(
                 "a callback records one call of learn()",
                 got="a second call",
@@ -142,108 +125,77 @@ class WeightTrajectoryCallback(BaseCallback):
                 where=type(model).__name__,
                 do="leave optimizer_moments out",
             )
-        info = self._describe(model, self._norm)
         self._actor = actor_parameters(model.policy)
         self._critic = critic_parameters(model.policy)
-        self._iteration = self._step = self._step_before = 0
-        self._pending: dict[str, Any] | None = None
-        self._ep_rew_mean = float("nan")
-        self._writer = RunWriter(self.path, info, resume=self.resume)
-        self._hook = model.policy.optimizer.register_step_post_hook(self._on_gradient_step)
-        # For notebooks. Not at exit: Zarr's threads are gone by then.
-        weakref.finalize(self, self._writer.close, "crashed").atexit = False
-        self._snapshot()
-
-    def _describe(self, model: OnPolicyAlgorithm, norm: Normalizers) -> RunInfo:
-        policy = describe_policy(model.policy, norm.unknown)
-        critic = describe_layout(critic_parameters(model.policy), policy)
-        probes = self.probe_observations if policy.observation_shape else 0
-        return RunInfo(
+        info = describe_run(
+            model,
+            self._norm,
             run_id=self.run_id,
-            layout=describe_layout(actor_parameters(model.policy), policy),
-            policy=policy,
-            env=describe_env(model, norm.wrappers),
-            algorithm=describe_algorithm(model),
-            seed=model.seed,
-            cadence=describe_cadence(model, self.every),
-            obs_norm=norm.obs_norm,
-            ret_norm=norm.read_ret is not None,
-            diagnostics=(*DIAGNOSTICS.get(type(model).__name__, ()), "ep_rew_mean"),
-            critic_layout=critic if self.critic else None,
+            every=self.every,
+            critic=self.critic,
             optimizer_moments=self.optimizer_moments,
-            probe_observations=min(probes, model.n_steps * model.n_envs),
-            provenance=describe_provenance(),
+            probe_observations=self.probe_observations,
             block=self.block,
         )
+        steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
+        self._recorder = Recorder(
+            self.path,
+            info,
+            self._read,
+            every=self.every,
+            steps_per_epoch=steps // getattr(model, "n_epochs", 1) if steps else None,
+            resume=self.resume,
+        )
+        self._hook = model.policy.optimizer.register_step_post_hook(self._on_gradient_step)
+        # For notebooks. Not at exit: Zarr's threads are gone by then.
+        weakref.finalize(self, self._recorder.writer.close, "crashed").atexit = False
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        self._finish_iteration()
+        self._recording.end_update(self._diagnostics())
 
     def _on_rollout_end(self) -> None:
-        self._iteration += 1
-        self._step_before = self._step
-        episodes = [episode["r"] for episode in self._algorithm.ep_info_buffer or ()]
-        self._ep_rew_mean = float(np.mean(episodes)) if episodes else float("nan")
+        returns = [episode["r"] for episode in self._algorithm.ep_info_buffer or ()]
+        inputs: np.ndarray = np.empty(0)
         if self.writer.info.probe_observations:
             inputs = np.asarray(self._algorithm.rollout_buffer.observations, np.float32)
             inputs = inputs.reshape(-1, *self.writer.info.policy.observation_shape)
-            k = self.writer.info.probe_observations
-            self.writer.append_iteration(inputs[np.arange(k) * len(inputs) // k])
+        self._recording.end_rollout(returns, inputs)
 
     def _on_gradient_step(self, *_: object) -> None:
-        self._step += 1
-        if self._step % self.every == 0:
-            self._snapshot()
+        self._recording.end_gradient_step()
 
     def _on_training_end(self) -> None:
-        if self._step % self.every:
-            self._snapshot()
-        self._finish_iteration()
-        self.close("complete")
+        self._hook.remove()
+        self._recording.end_training(self._diagnostics())
 
-    def _snapshot(self) -> None:
-        """Copy the policy as it is now; it is appended when the next one comes."""
-        self._append_pending()
+    @property
+    def _recording(self) -> Recorder:
+        if self._recorder is None:
+            raise CollectError(
+                "nothing is recorded before training starts",
+                where=self.path,
+                do="pass the callback to model.learn(..., callback=...)",
+            )
+        return self._recorder
+
+    def _read(self) -> Reading:
         policy, norm = self._algorithm.policy, self._norm
-        weights = check_finite("policy/weights", _flat([p.detach() for p in self._actor.values()]))
-        steps = self._step - self._step_before
-        per_epoch = self._steps_per_epoch()
-        self._pending = {
-            "weights": weights,
+        return {
+            "weights": _flat([p.detach() for p in self._actor.values()]),
             "num_timesteps": self._algorithm.num_timesteps,
-            "iteration": self._iteration,
-            "epoch": steps // per_epoch if per_epoch else -1,
-            "gradient_step": self._step,
-            "phase": (steps - 1) // self.every if self._step else -1,
-            "learning_rate": policy.optimizer.param_groups[0]["lr"] if self._step else float("nan"),
+            "learning_rate": policy.optimizer.param_groups[0]["lr"],
             "obs_norm": norm.read_obs() if norm.read_obs else None,
             "ret_norm": norm.read_ret() if norm.read_ret else None,
-            "train": {"ep_rew_mean": self._ep_rew_mean},
             "critic": _flat([p.detach() for p in self._critic.values()]) if self.critic else None,
             "moments": self._moments(policy.optimizer) if self.optimizer_moments else None,
         }
 
-    def _finish_iteration(self) -> None:
-        """Put the diagnostics of the update that just ended beside the snapshot of its end."""
-        if self._pending is not None and self._pending["gradient_step"] == self._step > 0:
-            logged = self.logger.name_to_value
-            for name in DIAGNOSTICS.get(type(self.model).__name__, ()):
-                self._pending["train"][name] = float(logged.get(f"train/{name}", np.nan))
-            self._append_pending()
-
-    def _append_pending(self) -> None:
-        if self._pending is not None:
-            snapshot, self._pending = self._pending, None
-            self.writer.append(**snapshot)
-
-    def _steps_per_epoch(self) -> int | None:
-        cadence = self.writer.info.cadence
-        steps = cadence.gradient_steps_per_iteration if cadence else None
-        epochs = getattr(self.model, "n_epochs", 1)
-        return steps // epochs if steps else None
+    def _diagnostics(self) -> dict[str, float]:
+        logged, names = self.logger.name_to_value, DIAGNOSTICS.get(type(self.model).__name__, ())
+        return {name: float(logged.get(f"train/{name}", np.nan)) for name in names}
 
     def _moments(self, optimizer: torch.optim.Optimizer) -> tuple[np.ndarray, np.ndarray]:
         def read(name: str) -> np.ndarray:

@@ -20,8 +20,17 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
+from weighttraj.collect.normalizers import Normalizers
 from weighttraj.errors import CollectError
-from weighttraj.format import Algorithm, Cadence, EnvInfo, ParamLayout, PolicySpec, Provenance
+from weighttraj.format import (
+    Algorithm,
+    Cadence,
+    EnvInfo,
+    ParamLayout,
+    PolicySpec,
+    Provenance,
+    RunInfo,
+)
 from weighttraj.format.layout import Role
 
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy", "zarr", "weighttraj")
@@ -98,6 +107,51 @@ def actor_parameters(policy: ActorCriticPolicy) -> dict[str, nn.Parameter]:
 def critic_parameters(policy: ActorCriticPolicy) -> dict[str, nn.Parameter]:
     """Parameters that only the critic uses."""
     return {name: p for name, p in policy.named_parameters() if name.startswith(_CRITIC)}
+
+
+def describe_run(
+    model: OnPolicyAlgorithm,
+    norm: Normalizers,
+    *,
+    run_id: str,
+    every: int,
+    critic: bool,
+    optimizer_moments: bool,
+    probe_observations: int,
+    block: int,
+) -> RunInfo:
+    """The metadata of a run, before its training.
+
+    Args:
+        model: what will be trained.
+        norm: its normalisers.
+        run_id: id of the run.
+        every: gradient steps from one snapshot to the next.
+        critic: whether the critic's parameters are stored.
+        optimizer_moments: whether Adam's moments are stored.
+        probe_observations: network inputs kept of each rollout.
+        block: snapshots in a chunk and in a commit.
+    """
+    policy = describe_policy(model.policy, norm.unknown)
+    probes = probe_observations if policy.observation_shape else 0
+    of_critic = describe_layout(critic_parameters(model.policy), policy)
+    return RunInfo(
+        run_id=run_id,
+        layout=describe_layout(actor_parameters(model.policy), policy),
+        policy=policy,
+        env=describe_env(model, norm.wrappers),
+        algorithm=describe_algorithm(model),
+        seed=model.seed,
+        cadence=describe_cadence(model, every),
+        obs_norm=norm.obs_norm,
+        ret_norm=norm.read_ret is not None,
+        diagnostics=(*DIAGNOSTICS.get(type(model).__name__, ()), "ep_rew_mean"),
+        critic_layout=of_critic if critic else None,
+        optimizer_moments=optimizer_moments,
+        probe_observations=min(probes, model.n_steps * model.n_envs),
+        provenance=describe_provenance(),
+        block=block,
+    )
 
 
 def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> ParamLayout:

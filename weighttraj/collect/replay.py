@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import tempfile
 from pathlib import Path
@@ -13,8 +14,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.describe import describe_provenance
+from weighttraj.collect.population import Population, origins_of
 from weighttraj.collect.ppo import make_ppo
-from weighttraj.collect.recipe import Recipe
+from weighttraj.collect.recipe import Recipe, Store
+from weighttraj.collect.tasks import open_recorder
 from weighttraj.errors import CollectError
 from weighttraj.format import Run, open_dataset, open_run
 from weighttraj.format.writer import explain_difference
@@ -67,20 +70,33 @@ def _compare(run: Run, recipe: Recipe, n: int) -> list[str]:
 def _train(run: Run, recipe: Recipe, n: int, path: Path) -> Run:
     threads = torch.get_num_threads()
     torch.set_num_threads(run.info.provenance.threads or 1)
-    config, every = recipe.ppo, recipe.store.every
     cadence = run.info.cadence
     steps = (cadence.gradient_steps_per_iteration if cadence else None) or 1
-    iterations = math.ceil((n - 1) * every / steps)
-    recorder = WeightTrajectoryCallback(path, every=every, probe_observations=0)
+    iterations = math.ceil((n - 1) * recipe.store.every / steps)
+    train = _by_population if recipe.collect.collector == "population" else _by_sb3
     try:
         # The schedules need the whole length, so the training is cut short, not shortened.
-        stop = _StopAfter(iterations * config.n_steps)
-        model = make_ppo(config, seed=run.info.seed or 0)
-        model.learn(config.n_iterations * config.n_steps, callback=[recorder, stop])
+        train(recipe, run.info.seed or 0, iterations * recipe.ppo.n_steps, path)
     finally:
-        recorder.close()
         torch.set_num_threads(threads)
     return open_run(path)
+
+
+def _by_sb3(recipe: Recipe, seed: int, num_timesteps: int, path: Path) -> None:
+    config = recipe.ppo
+    with WeightTrajectoryCallback(path, every=recipe.store.every, probe_observations=0) as recorder:
+        model = make_ppo(config, seed=seed)
+        stop = _StopAfter(num_timesteps)
+        model.learn(config.n_iterations * config.n_steps, callback=[recorder, stop])
+
+
+def _by_population(recipe: Recipe, seed: int, num_timesteps: int, path: Path) -> None:
+    origins = origins_of(recipe.ppo, [seed])
+    store = Store(every=recipe.store.every, probe_observations=0)
+    with contextlib.closing(Population(recipe.ppo, origins)) as population:
+        recorder = open_recorder(population, 0, origins[0], path, store)
+        with contextlib.closing(recorder):
+            population.train([recorder], lambda: population.num_timesteps >= num_timesteps)
 
 
 class _StopAfter(BaseCallback):

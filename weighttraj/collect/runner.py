@@ -1,4 +1,4 @@
-"""From a recipe to a data set: one process a run, and on again where it stopped."""
+"""From a recipe to a data set: runs spread over processes, and on again where it stopped."""
 
 from __future__ import annotations
 
@@ -9,40 +9,25 @@ import queue
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import torch
 from filelock import FileLock
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from stable_baselines3.common.callbacks import BaseCallback
 
-from weighttraj.collect.callback import WeightTrajectoryCallback
-from weighttraj.collect.ppo import make_ppo
-from weighttraj.collect.recipe import Recipe
+from weighttraj.collect.population import check_config
+from weighttraj.collect.recipe import Collect, Recipe
+from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
 from weighttraj.errors import CollectError, ReplayError, WeightTrajError
 from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_dataset
 from weighttraj.format.catalog import MANIFEST, read_dataset_info, write_dataset_info
 from weighttraj.format.integrity import seal
-from weighttraj.format.packing import pack
 from weighttraj.format.storage import PACKED, read_info
-
-Report = Callable[[int, int], None]
-"""Called with a seed and its environment steps so far."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """One run to be made: idempotent, so that it may be done again after a failure."""
-
-    recipe: Recipe
-    seed: int
-    path: Path
 
 
 def collect(
@@ -63,16 +48,19 @@ def collect(
         recipe: what to collect.
         out: folder of the data set.
         seeds: only these; seeds that the recipe does not name belong to no split.
-        workers: processes; 1 means this one.
+        workers: processes; 1 means this one. Each trains one run at a time, or a population.
         console: where progress is shown; None: nowhere.
 
     Raises:
-        CollectError: the folder holds another data set, or a run failed.
+        CollectError: the folder holds another data set, a run failed, or a population cannot train
+            with the recipe's settings.
         RecipeError: the recipe contradicts itself.
         KeyboardInterrupt: it was stopped; what was committed stays.
     """
     if workers < 1:
         raise CollectError("nobody to do the work", expected="workers at least 1", got=workers)
+    if recipe.collect.collector == "population":
+        check_config(recipe.ppo)
     out = Path(out)
     console = console or Console(quiet=True)
     out.mkdir(parents=True, exist_ok=True)
@@ -97,47 +85,6 @@ def collect(
     return open_dataset(out)
 
 
-def collect_run(task: Task, report: Report) -> None:
-    """Collect one run in this process, with one thread: the thread count moves the bits."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    store, config = task.recipe.store, task.recipe.ppo
-    callback = WeightTrajectoryCallback(
-        task.path,
-        every=store.every,
-        critic=store.critic,
-        optimizer_moments=store.optimizer_moments,
-        probe_observations=store.probe_observations,
-        block=store.block,
-        resume=True,
-    )
-    try:
-        model = make_ppo(config, seed=task.seed)
-        progress = _ProgressCallback(task.seed, report)
-        if not _is_complete(task.path):
-            model.learn(config.n_iterations * config.n_steps, callback=[callback, progress])
-    finally:
-        callback.close()
-        torch.set_num_threads(threads)
-    pack(task.path, profile=store.profile)
-
-
-def _is_complete(path: Path) -> bool:
-    return path.exists() and read_info(path).status == "complete"
-
-
-class _ProgressCallback(BaseCallback):
-    def __init__(self, seed: int, report: Report) -> None:
-        super().__init__()
-        self._seed, self._report = seed, report
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        self._report(self._seed, self.num_timesteps)
-
-
 def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     """Write ``dataset.json`` with every run that will be there."""
     document = json.loads(json.dumps(asdict(recipe))) | {"seeds": recipe.seeds.by_split()}
@@ -147,7 +94,10 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     )
     if (out / "dataset.json").exists():
         old = read_dataset_info(out)
-        before, now = (_flat({**d, "seeds": None}) for d in (old.recipe, document))
+        # Neither changes what a run is; and data sets that are older than [collect] are SB3's.
+        default, ignored = _flat({"collect": asdict(Collect())}), {"collect.population": None}
+        both = ({**recipe, "seeds": None} for recipe in (old.recipe, document))
+        before, now = (default | _flat(recipe) | ignored for recipe in both)
         other = sorted(k for k in before | now if before.get(k) != now.get(k))
         if other:
             raise CollectError(
@@ -204,42 +154,34 @@ def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _run(tasks: list[Task], workers: int, console: Console) -> list[tuple[Task, BaseException]]:
+def _run(tasks: list[Task], workers: int, console: Console) -> list[Failure]:
     """Do the tasks; return those that failed."""
     if not tasks:
         return []
-    failures: list[tuple[Task, BaseException]] = []
+    blocks = blocks_of(tasks, workers)
     with _progress(tasks, console) as report:
         if workers == 1:
-            for task in tasks:
-                try:
-                    collect_run(task, report)
-                except Exception as error:
-                    failures.append((task, error))
-        else:
-            failures += _run_in_processes(tasks, workers, report)
-    return failures
+            return [failure for block in blocks for failure in collect_block(block, report)]
+        return _run_in_processes(blocks, workers, report)
 
 
-def _run_in_processes(
-    tasks: list[Task], workers: int, report: Report
-) -> list[tuple[Task, BaseException]]:
+def _run_in_processes(blocks: list[list[Task]], workers: int, report: Report) -> list[Failure]:
     context = multiprocessing.get_context("spawn")
-    failures: list[tuple[Task, BaseException]] = []
+    failures: list[Failure] = []
     with (
         _noted_interrupts() as interrupted,
         context.Manager() as manager,
         # Interrupts are the business of this process: it tells the others to stop.
         ProcessPoolExecutor(
-            min(workers, len(tasks)),
+            min(workers, len(blocks)),
             mp_context=context,
             initializer=signal.signal,
             initargs=(signal.SIGINT, signal.SIG_IGN),
         ) as pool,
     ):
         steps, stop = manager.Queue(), manager.Event()
-        futures: dict[Future[None], Task] = {
-            pool.submit(_collect_in_process, task, steps, stop): task for task in tasks
+        futures: dict[Future[list[Failure]], list[Task]] = {
+            pool.submit(_collect_in_process, block, steps, stop): block for block in blocks
         }
         while not interrupted.is_set() and not (
             all(future.done() for future in futures) and steps.empty()
@@ -250,25 +192,23 @@ def _run_in_processes(
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
             raise KeyboardInterrupt
-        for future, task in futures.items():
+        for future, block in futures.items():
             error = future.exception()
             if isinstance(error, BrokenProcessPool):
                 error = CollectError("its process was killed", do="is there enough memory?")
-            if error is not None:
-                failures.append((task, error))
+            failures += future.result() if error is None else [(task, error) for task in block]
     return failures
 
 
-def _collect_in_process(task: Task, steps: Any, stop: Any) -> None:
-    """Collect one run in a worker; it stops, with what it has committed, when it is told to."""
+def _collect_in_process(block: list[Task], steps: Any, stop: Any) -> list[Failure]:
+    """Collect runs in a worker; it stops, with what it has committed, when it is told to."""
 
     def report(seed: int, num_timesteps: int) -> None:
         steps.put((seed, num_timesteps))
         if stop.is_set():
             raise KeyboardInterrupt
 
-    if not stop.is_set():
-        collect_run(task, report)
+    return [] if stop.is_set() else collect_block(block, report)
 
 
 @contextlib.contextmanager
@@ -308,10 +248,10 @@ def _progress(tasks: list[Task], console: Console) -> Iterator[Report]:
 
 def _plan(
     recipe: Recipe, out: Path, entries: list[RunEntry], console: Console
-) -> tuple[list[Task], list[tuple[Task, BaseException]]]:
+) -> tuple[list[Task], list[Failure]]:
     """Runs that are still to be made, and those that cannot be read."""
     tasks: list[Task] = []
-    unreadable: list[tuple[Task, BaseException]] = []
+    unreadable: list[Failure] = []
     for entry in entries:
         task = Task(recipe=recipe, seed=cast(int, entry.seed), path=out / entry.path)
         try:
@@ -336,7 +276,7 @@ def _progress_of(info: RunInfo | None) -> str:
     )
 
 
-def _mismatches(failures: list[tuple[Task, BaseException]]) -> list[tuple[Task, ReplayError]]:
+def _mismatches(failures: list[Failure]) -> list[tuple[Task, ReplayError]]:
     return [(task, error) for task, error in failures if isinstance(error, ReplayError)]
 
 
