@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 RUNS, SNAPSHOTS = "tables/runs.parquet", "tables/snapshots.parquet"
 
+_ROWS = 64
+"""Snapshots that are held at a time: of a large policy they fill memory."""
+
 
 def write_tables(dataset: Dataset) -> None:
     """Write both tables of a data set.
@@ -69,8 +72,8 @@ def snapshot_columns(run: Run) -> dict[str, Any]:
     """
     weights = run.weights
     norms, steps, last = [], [], None
-    for start in range(0, len(run), 512):
-        rows = weights[start : start + 512].astype(np.float64)
+    for start in range(0, len(run), _ROWS):
+        rows = weights[start : start + _ROWS].astype(np.float64)
         norms.append(np.linalg.norm(rows, axis=1))
         steps.append(
             np.linalg.norm(

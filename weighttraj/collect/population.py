@@ -1,0 +1,311 @@
+"""Many PPO trainings in lockstep in one process: the fast road to many seeds.
+
+A population does what ``ppo.make_ppo`` and ``learn`` do, for many seeds at once: networks are
+stacked, physics is batched. It draws the random numbers that SB3 draws, each learner from
+generators of its own that go on where SB3's stand once the model is made. So a learner is the SB3
+run of its seed up to the rounding of float32, which training magnifies in time as it does any
+difference. A learner's bits depend on its seed alone, not on those beside it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from weighttraj import environments
+from weighttraj.collect.describe import actor_parameters, critic_parameters
+from weighttraj.collect.learners import Learners, Rollout
+from weighttraj.collect.networks import MLP, Stack
+from weighttraj.collect.ppo import PPOConfig, make_ppo
+from weighttraj.collect.recorder import Reading
+from weighttraj.collect.rollouts import Environments, check_kernel
+from weighttraj.errors import CollectError
+
+_SERIAL = 15
+"""Torch draws up to so many normal numbers one by one, whatever their grouping; more of them by
+another algorithm."""
+_GROUP = 2**20
+"""Parameters that are updated together: 16 MB with gradients and moments, which caches hold."""
+_LOG_SQRT_2PI = np.float32(0.5 * np.log(2 * np.pi))
+
+
+@runtime_checkable
+class Watcher(Protocol):
+    """Who follows one learner: see ``Recorder``."""
+
+    def end_rollout(self, returns: Sequence[Any], inputs: np.ndarray) -> None:
+        """A rollout is there."""
+
+    def end_gradient_step(self) -> None:
+        """The weights have changed."""
+
+    def end_update(self, diagnostics: Mapping[str, float]) -> None:
+        """An update has ended."""
+
+    def end_training(self, diagnostics: Mapping[str, float]) -> None:
+        """The last update has ended."""
+
+
+class Origin:
+    """What SB3 makes of a seed before training begins.
+
+    Args:
+        config: settings of the training.
+        seed: of the run.
+    """
+
+    def __init__(self, config: PPOConfig, seed: int) -> None:
+        self.seed = seed
+        self.noise, self.shuffle = torch.Generator(), np.random.RandomState()
+        with _undisturbed():
+            self.model = make_ppo(config, seed=seed)
+            self.noise.set_state(torch.get_rng_state())
+            self.shuffle.set_state(np.random.get_state())  # noqa: NPY002 (SB3 uses it)
+            # As learn() begins: only an observation shows the type that statistics are kept in.
+            cast(VecEnv, self.model.get_env()).reset()
+
+
+class Population:
+    """Learners of several seeds, trained together. Torch should be set to one thread.
+
+    Args:
+        config: settings, the same for all.
+        origins: where each learner begins, at least two: torch computes for a single learner by
+            other kernels than for several, and its bits would be others.
+
+    Raises:
+        CollectError: a population cannot do what the settings ask for.
+    """
+
+    def __init__(self, config: PPOConfig, origins: Sequence[Origin]) -> None:
+        check_config(config)
+        policy = origins[0].model.policy
+        self._config = config
+        self._noise = [origin.noise for origin in origins]
+        self._shuffle = [origin.shuffle for origin in origins]
+        self.stack = _stack(origins)
+        """Parameters of all learners."""
+        actor, critic = list(actor_parameters(policy)), list(critic_parameters(policy))
+        self._actor, self._critic = self.stack.places(actor), self.stack.places(critic)
+        layers = _layers(actor), _layers(critic)
+        self._act, self._judge = (MLP(self.stack, names, 1) for names in layers)
+        groups = _groups(*self.stack.values.shape)
+        self.groups = [(part, Learners(config, self.stack[part], *layers)) for part in groups]
+        """Learners that are updated together."""
+        self._environments = Environments(config, [origin.seed for origin in origins])
+        self._learning_rate = config.learning_rate
+        self.num_timesteps = 0
+        """Environment steps of each learner so far."""
+
+    def read(self, learner: int, *, critic: bool = False, moments: bool = False) -> Reading:
+        """What a learner is now.
+
+        Args:
+            learner: which.
+            critic: read the critic's parameters too.
+            moments: read Adam's moments of the actor's parameters too.
+        """
+        row, actor = self.stack.values[learner].numpy(), self._actor
+        return {
+            "weights": row[actor],
+            "num_timesteps": self.num_timesteps,
+            "learning_rate": self._learning_rate,
+            "obs_norm": self._environments.observations.of(learner),
+            "ret_norm": self._environments.rewards.of(learner),
+            "critic": row[self._critic] if critic else None,
+            "moments": self._moments(learner) if moments else None,
+        }
+
+    def train(self, watchers: Sequence[Watcher], stop: Callable[[], bool] = lambda: False) -> None:
+        """Train to the end.
+
+        Args:
+            watchers: who follows the first learners; the others are not followed.
+            stop: asked before each rollout; True ends the training there.
+        """
+        total = self._config.n_iterations * self._config.n_steps
+        while self.num_timesteps < total and not stop():
+            self._iterate(watchers, total)
+
+    def close(self) -> None:
+        """Close the environments."""
+        self._environments.close()
+
+    @torch.no_grad()
+    def _iterate(self, watchers: Sequence[Watcher], total: int) -> None:
+        rollout = self._roll_out()
+        self.num_timesteps += self._config.n_steps
+        for watcher, returns, inputs in zip(
+            watchers, self._environments.returns, rollout.observations, strict=False
+        ):
+            watcher.end_rollout(returns, inputs.numpy())
+        self._learning_rate = self._config.learning_rate_at(1.0 - self.num_timesteps / total)
+        order = self._permutations()
+        for part, learners in self.groups:
+            some = watchers[part]
+            diagnostics = learners.update(
+                rollout[part], order[:, part], self._learning_rate, _after_step(some)
+            )
+            for watcher, figures in zip(some, diagnostics, strict=False):
+                last = self.num_timesteps >= total
+                (watcher.end_training if last else watcher.end_update)(figures)
+
+    def _roll_out(self) -> Rollout:
+        """Let every learner act for a rollout; then judge what it saw, in one go."""
+        config, environments = self._config, self._environments
+        n, size = environments.inputs.shape
+        buffer = RolloutBuffer(
+            config.n_steps,
+            spaces.Box(-np.inf, np.inf, (size,)),
+            environments.action_space,
+            gamma=config.gamma,
+            gae_lambda=config.gae_lambda,
+            n_envs=n,
+        )
+        noise, means = self._draw_noise(), np.empty_like(buffer.actions)
+        std = self.stack.value("log_std").exp().numpy()
+        for t in range(config.n_steps):
+            buffer.observations[t] = inputs = environments.inputs
+            buffer.episode_starts[t] = environments.starting
+            means[t] = self._act.forward(torch.from_numpy(inputs)[:, None])[:, 0].numpy()
+            buffer.actions[t] = actions = means[t] + noise[t] * std
+            buffer.rewards[t] = environments.step(actions)
+        buffer.log_probs[:] = _log_probs(buffer.actions, means, std)
+        observations = _by_learner(buffer.observations)
+        for part, learners in self.groups:
+            buffer.values[:, part] = learners.estimate(observations[part]).T.numpy()
+        last = self._judge.forward(torch.from_numpy(environments.inputs)[:, None])
+        buffer.compute_returns_and_advantage(last, environments.starting)
+        return Rollout(
+            observations=observations,
+            actions=_by_learner(buffer.actions),
+            log_probs=_by_learner(buffer.log_probs),
+            values=_by_learner(buffer.values),
+            advantages=_by_learner(buffer.advantages),
+            returns=_by_learner(buffer.returns),
+        )
+
+    def _draw_noise(self) -> np.ndarray:
+        """Standard normal numbers as SB3's distribution draws them, (step, learner, action)."""
+        steps, size = self._config.n_steps, self._environments.action_space.shape[0]
+        noise = torch.stack([draw_normal(g, steps, size) for g in self._noise], dim=1)
+        return noise.numpy()
+
+    def _permutations(self) -> np.ndarray:
+        """Order of the samples as SB3's buffer draws it, (epoch, learner, step)."""
+        epochs, steps = range(self._config.n_epochs), self._config.n_steps
+        orders = [[state.permutation(steps) for _ in epochs] for state in self._shuffle]
+        return np.array(orders).swapaxes(0, 1)
+
+    def _moments(self, learner: int) -> tuple[np.ndarray, np.ndarray]:
+        part, learners = next(pair for pair in self.groups if learner < pair[0].stop)
+        first, second = (
+            learners.moments(name)[learner - part.start].numpy()[self._actor]
+            for name in ("exp_avg", "exp_avg_sq")
+        )
+        return first, second
+
+
+def origins_of(config: PPOConfig, seeds: Sequence[int]) -> list[Origin]:
+    """Where the learners of some seeds begin; a lone one comes twice, see ``Population``."""
+    return [Origin(config, seed) for seed in (seeds if len(seeds) > 1 else [*seeds, *seeds])]
+
+
+def draw_normal(generator: torch.Generator, steps: int, size: int) -> Tensor:
+    """The numbers of ``steps`` draws of ``size`` standard normal ones, float32 (steps, size)."""
+    numbers = torch.empty(steps * size)
+    together = size if size > _SERIAL else _SERIAL
+    for start in range(0, len(numbers), together):
+        numbers[start : start + together].normal_(generator=generator)
+    return numbers.view(steps, size)
+
+
+def check_config(config: PPOConfig) -> None:
+    """Check that a population can do what a training asks for.
+
+    Raises:
+        CollectError: it cannot, or the environment is unknown.
+    """
+    wrong = {
+        "normalization": config.normalization != "gymnasium",
+        "truncation_as_termination": not config.truncation_as_termination,
+        "n_steps": config.n_steps % config.batch_size != 0,
+        "batch_size": config.batch_size % 16 != 0,
+    }
+    if any(wrong.values()):
+        raise CollectError(
+            "a population cannot train with these settings",
+            expected='normalization = "gymnasium", truncation_as_termination = true, n_steps a '
+            "multiple of batch_size, and that a multiple of 16",
+            got={name: getattr(config, name) for name, is_wrong in wrong.items() if is_wrong},
+            do='change them, or set collector = "sb3" in [collect]',
+        )
+    env = environments.make(config.env_id)
+    check_kernel(env, config.env_id)
+    env.close()
+
+
+def _after_step(watchers: Sequence[Watcher]) -> Callable[[], None]:
+    def tell() -> None:
+        for watcher in watchers:
+            watcher.end_gradient_step()
+
+    return tell
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Leave the global generators as they were."""
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])
+
+
+def _stack(origins: Sequence[Origin]) -> Stack:
+    """The initial parameters of all learners."""
+    parameters = [dict(origin.model.policy.named_parameters()) for origin in origins]
+    stack = Stack({name: p.shape for name, p in parameters[0].items()}, len(origins))
+    for i, named in enumerate(parameters):
+        for name, parameter in named.items():
+            stack.value(name)[i] = parameter.detach()
+    return stack
+
+
+def _layers(names: Sequence[str]) -> list[str]:
+    """Prefixes of the layers among some parameters, first layer first."""
+    return [name.removesuffix(".weight") for name in names if name.endswith(".weight")]
+
+
+def _groups(learners: int, width: int) -> list[slice]:
+    """Learners that are updated together, at least two each."""
+    count = min(learners // 2, -(-learners * width // _GROUP))
+    bounds = [learners * i // count for i in range(count + 1)]
+    return [slice(start, stop) for start, stop in itertools.pairwise(bounds)]
+
+
+def _log_probs(actions: np.ndarray, means: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Log-densities of actions, summed over their dimensions, float32 (step, learner)."""
+    squares = np.square(actions - means) / (2 * np.square(std))
+    return np.asarray((-squares - np.log(std) - _LOG_SQRT_2PI).sum(-1))
+
+
+def _by_learner(values: np.ndarray) -> Tensor:
+    """(step, learner, ...) as a tensor (learner, step, ...)."""
+    return torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1)))
+
+
+__all__ = ["Origin", "Population", "check_config", "draw_normal", "origins_of"]

@@ -1,0 +1,125 @@
+"""Rollouts of many learners at once: each in its own environment, all in one batch of physics."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from weighttraj import environments
+from weighttraj.collect.ppo import PPOConfig
+from weighttraj.collect.statistics import ObservationStatistics, RewardStatistics
+from weighttraj.errors import CollectError
+from weighttraj.policies.kernels import Kernel, kernel_for
+from weighttraj.policies.simulators import Physics, start_of
+
+_BOUND = 10.0
+_EPISODES = 100
+"""Episodes whose mean return is reported, as SB3's ``stats_window_size``."""
+
+
+class Environments:
+    """One environment a learner, with the numbers of ``ppo.make_env`` in SB3's ``DummyVecEnv``.
+
+    Resets go through an environment of the learner's own, so that its random numbers are
+    Gymnasium's; steps are batched physics, bit by bit Gymnasium's too.
+
+    Args:
+        config: which environment, and the discount.
+        seeds: of the first reset, one a learner.
+
+    Raises:
+        CollectError: the environment is unknown, or has no batched physics.
+    """
+
+    def __init__(self, config: PPOConfig, seeds: Sequence[int]) -> None:
+        self._envs = [environments.make(config.env_id) for _ in seeds]
+        self._kernels = [check_kernel(env, config.env_id) for env in self._envs]
+        self._physics = Physics(self._kernels[0], len(seeds))
+        self._limit = _time_limit(self._envs[0])
+        self._everyone = np.arange(len(seeds))
+        self.action_space = cast(spaces.Box, self._envs[0].action_space)
+        first = self._reset(self._everyone, seeds)
+        self.observations = ObservationStatistics(first, _BOUND)
+        self.rewards = RewardStatistics(len(seeds), config.gamma, _BOUND)
+        self.inputs = self.observations.normalize(first, slice(None))
+        """What the agents see now, float32 (learner, obs)."""
+        self.starting = np.ones(len(seeds), bool)
+        """Whether that is the first observation of an episode, (learner,)."""
+        self.returns: list[deque[float]] = [deque(maxlen=_EPISODES) for _ in seeds]
+        """Returns of each learner's last episodes."""
+        self._return = np.zeros(len(seeds))
+        self._length = np.zeros(len(seeds), np.int64)
+
+    def step(self, actions: np.ndarray) -> np.ndarray:
+        """Step every environment; those that end begin anew.
+
+        Args:
+            actions: float32 (learner, action); clipped here, as SB3 clips them.
+
+        Returns:
+            Scaled rewards, float64 (learner,).
+        """
+        actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        # As under Gymnasium, a simulation that breaks down goes on from MuJoCo's own reset.
+        step = self._physics.step(self._everyone, actions)
+        self._return += step.rewards
+        self._length += 1
+        self.starting = step.terminated | (self._length >= self._limit)
+        self.observations.update(step.observations, slice(None))
+        self.inputs = self.observations.normalize(step.observations, slice(None))
+        rewards = self.rewards.scale(step.rewards, step.terminated)
+        if self.starting.any():
+            self._restart(np.flatnonzero(self.starting))
+        return rewards
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self._envs:
+            env.close()
+
+    def _restart(self, learners: np.ndarray) -> None:
+        for learner in learners:
+            self.returns[learner].append(float(self._return[learner]))
+        self._return[learners], self._length[learners] = 0, 0
+        first = self._reset(learners, [None] * len(learners))
+        self.observations.update(first, learners)
+        self.inputs[learners] = self.observations.normalize(first, learners)
+
+    def _reset(self, learners: np.ndarray, seeds: Sequence[int | None]) -> np.ndarray:
+        """Reset the environments of some learners; observations, float64 (learner, obs)."""
+        starts = [
+            start_of(self._kernels[learner], self._envs[learner].reset(seed=seed)[0])
+            for learner, seed in zip(learners, seeds, strict=True)
+        ]
+        self._physics.load(learners, starts)
+        return np.stack([start.observation for start in starts])
+
+
+def check_kernel(env: gym.Env[Any, Any], env_id: str) -> Kernel:
+    """The batched physics of an environment.
+
+    Raises:
+        CollectError: it has none.
+    """
+    kernel = kernel_for(env)
+    if kernel is None:
+        raise CollectError(
+            "a population needs batched physics, and this environment has none",
+            expected="one of Gymnasium's planar MuJoCo environments, without further wrappers",
+            got=f"{env_id}: {env}",
+            do='set collector = "sb3" in [collect]: it takes any environment',
+        )
+    return kernel
+
+
+def _time_limit(env: gym.Env[Any, Any]) -> float:
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    return limit or float("inf")
+
+
+__all__ = ["Environments", "check_kernel"]
