@@ -34,6 +34,7 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	WEIGHTTRAJ_CACHE=data/bench/cache $(BIN)/python -W ignore tests/benchmarks/bench_load.py data/bench/*/runs/*.zarr.zip --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_callback.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_returns.py data/bench/inverted-pendulum data/bench/half-cheetah --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --save
 	$(BIN)/python tests/benchmarks/results.py
 
 stress: setup ## kill, flip, delete, fuzz: about an hour

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -48,18 +49,28 @@ def _quiet() -> Iterator[None]:
 def quiet_mujoco() -> Iterator[None]:
     """Without MuJoCo's own messages, which it also writes to MUJOCO_LOG.TXT in the current folder.
 
-    They tell of deprecated models, and of unstable simulations.
+    They tell of deprecated models, and of unstable simulations. Threads may enter it side by side.
     """
+    global _quiet_depth
     try:
         import mujoco
     except ModuleNotFoundError:
         yield
         return
-    mujoco.set_mju_user_warning(_ignore)
+    with _quiet_lock:
+        _quiet_depth += 1
+        mujoco.set_mju_user_warning(_ignore)
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(None)
+        with _quiet_lock:
+            _quiet_depth -= 1
+            if not _quiet_depth:
+                mujoco.set_mju_user_warning(None)
+
+
+_quiet_depth = 0
+_quiet_lock = threading.Lock()
 
 
 def _ignore(message: str) -> None:

@@ -85,7 +85,7 @@ def limit(run: wt.Run, sims: int, steps: int, actions: np.ndarray) -> float:
 
 def actions_of(evaluator: Evaluator, policies: Any, steps: int) -> np.ndarray:
     """What policies do in their first steps, (step, simulation, action)."""
-    simulator, taken = evaluator._simulator, []
+    simulator, taken = evaluator._simulators[0], []
     observations = simulator.reset(len(policies))
     everything = np.arange(len(observations))
     for _ in range(steps):

@@ -58,7 +58,13 @@ def render(results: dict[str, Any]) -> str:
             f"{100 * (callback['ratio_inside'] - 1):.2g} % of the training's CPU time and "
             f"{callback['extra_peak_mib'] / callback['block_mib']:.1f} blocks of memory."
         )
-    lines += [_returns(row) for row in results.get("returns", {}).values()]
+    returns = results.get("returns", {}).values()
+    lines += [_returns(row) for row in returns if isinstance(row, dict)]
+    lines += [
+        f"A population of {row['learners']}, {case}: {row['times_faster']:.1f} times the "
+        "environment steps of SB3 in the same CPU time, both recording."
+        for case, row in results.get("population", {}).get("cases", {}).items()
+    ]
     return "\n".join(lines)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
@@ -52,7 +55,7 @@ class Evaluator:
         env: the environment, as a run describes it.
         episodes: number of episodes.
         seed: of the first episode.
-        threads: for physics and networks.
+        threads: that play; each has policies of its own.
         block: policies that play at once; memory grows with it.
 
     Raises:
@@ -79,11 +82,12 @@ class Evaluator:
         self._info, self._threads, self._block = env, threads, block
         self._env = self._make()
         self._noise: dict[tuple[str, int], list[np.ndarray]] = {}
+        self._drawing = threading.Lock()
 
     @property
     def simulator(self) -> str:
         """What steps the environment: ``mujoco.batch`` or ``gymnasium``."""
-        return self._simulator.name
+        return self._simulators[0].name
 
     @overload
     def __call__(self, policy: Policy, *, deterministic: bool = True) -> EpisodeReturns: ...
@@ -108,18 +112,23 @@ class Evaluator:
         if isinstance(policy, Policy):
             returns, lengths = self(_batch_of(policy), deterministic=deterministic)
             return EpisodeReturns(returns[0], lengths[0])
-        most = min(self._block, self._simulator.most or self._block)
-        with _torch_threads(self._threads), environments.quiet_mujoco():
-            blocks = [
-                self._play(policy[start : start + most], deterministic)
-                for start in range(0, len(policy), most)
-            ]
-        returns, lengths = (np.concatenate(x) for x in zip(*blocks, strict=True))
+        size = self._size(len(policy))
+        blocks = [policy[start : start + size] for start in range(0, len(policy), size)]
+        # Torch's own threads would wait for their next piece in a loop, and take the time of the
+        # physics: each thread of ours plays a block with one.
+        with (
+            _one_torch_thread(),
+            environments.quiet_mujoco(),
+            ThreadPoolExecutor(len(self._simulators)) as pool,
+        ):
+            played = list(pool.map(lambda block: self._play(block, deterministic), blocks))
+        returns, lengths = (np.concatenate(x) for x in zip(*played, strict=True))
         return EpisodeReturns(returns, lengths)
 
     def close(self) -> None:
         """Close the environments."""
-        self._simulator.close()
+        for simulator in self._simulators:
+            simulator.close()
         self._env.close()
 
     def __enter__(self) -> Evaluator:
@@ -134,19 +143,44 @@ class Evaluator:
         self.close()
 
     @cached_property
-    def _simulator(self) -> Simulator:
-        return make_simulator(self._make, self.seeds, threads=self._threads)
+    def _simulators(self) -> list[Simulator]:
+        """One a thread; Gymnasium's loop is Python, which has one thread."""
+        first = make_simulator(self._make, self.seeds)
+        others = self._threads - 1 if first.most is None else 0
+        return [first, *(make_simulator(self._make, self.seeds) for _ in range(others))]
+
+    @cached_property
+    def _free(self) -> queue.SimpleQueue[Simulator]:
+        """Simulators that no thread is using."""
+        free: queue.SimpleQueue[Simulator] = queue.SimpleQueue()
+        for simulator in self._simulators:
+            free.put(simulator)
+        return free
+
+    def _size(self, policies: int) -> int:
+        """Policies that a thread plays at once."""
+        most = min(self._block, self._simulators[0].most or self._block)
+        return max(1, -(-min(most, policies) // len(self._simulators)))
 
     def _make(self) -> gym.Env[Any, Any]:
         limit = self._info.max_episode_steps
         limits = {} if limit is None else {"max_episode_steps": limit}
         return environments.make(self._info.id, **limits, **self._info.kwargs)
 
-    def _play(self, policies: PolicyBatch, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _play(self, policies: PolicyBatch, deterministic: bool) -> EpisodeReturns:
         """Returns and lengths (policy, episode) of a block of policies."""
+        simulator = self._free.get()
+        try:
+            return self._play_in(simulator, policies, deterministic)
+        finally:
+            self._free.put(simulator)
+
+    def _play_in(
+        self, simulator: Simulator, policies: PolicyBatch, deterministic: bool
+    ) -> EpisodeReturns:
         shape = (len(policies), len(self.seeds))
         returns, lengths = np.zeros(shape), np.zeros(shape, np.int64)
-        first = self._simulator.reset(len(policies))
+        first = simulator.reset(len(policies))
         observations = first.reshape(*shape, *first.shape[1:])
         sims = np.arange(returns.size).reshape(shape)
         running = np.ones(shape, bool)
@@ -160,20 +194,22 @@ class Evaluator:
             noise = None if deterministic else self._noise_at(step, policies.spec)
             actions = policies.act(observations, noise)
             playing = sims[running]
-            result = self._simulator.step(playing, actions[running])
+            result = simulator.step(playing, actions[running])
             step += 1
             observations[running] = result.observations
             returns.flat[playing] += np.where(result.unstable, np.nan, result.rewards)
             lengths.flat[playing] = step
             running[running] = ~(result.terminated | result.truncated | result.unstable)
-        return returns, lengths
+        return EpisodeReturns(returns, lengths)
 
     def _noise_at(self, step: int, spec: PolicySpec) -> np.ndarray:
         """What chance adds to the actions of a step, (episode, ...): the same for all policies."""
         size = max(1, len(spec.action_low))
-        drawn = self._noise.setdefault((spec.head, size), [])
-        while step >= len(drawn) * _NOISE_STEPS:
-            drawn.append(np.stack([self._draw(seed, len(drawn), spec) for seed in self.seeds], 1))
+        with self._drawing:
+            drawn = self._noise.setdefault((spec.head, size), [])
+            while step >= len(drawn) * _NOISE_STEPS:
+                part = [self._draw(seed, len(drawn), spec) for seed in self.seeds]
+                drawn.append(np.stack(part, 1))
         return np.asarray(drawn[step // _NOISE_STEPS][step % _NOISE_STEPS])
 
     @staticmethod
@@ -262,9 +298,9 @@ def _batch_of(policy: Policy) -> PolicyBatch:
 
 
 @contextmanager
-def _torch_threads(threads: int) -> Iterator[None]:
+def _one_torch_thread() -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     try:
         yield
     finally:
