@@ -91,9 +91,9 @@ def test_pack_and_cache(small_dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("weighttraj", "show", "nowhere"), "no run at nowhere"),
+        (("weighttraj", "show", "nowhere"), "no data set or run at nowhere"),
         (("weighttraj", "collect", "nowhere.toml"), "nowhere.toml"),
-        (("tipl", "train", "--data", "nowhere", "--out", "x"), "no data set at nowhere"),
+        (("tipl", "train", "--data", "nowhere", "--out", "x"), "no data set or run at nowhere"),
     ],
 )
 def test_errors_are_one_message(

@@ -79,10 +79,12 @@ ALLOWED = {
         "weighttraj.format.reader",
     ],
     "weighttraj.format.lint": ["weighttraj.format.reader"],
+    "weighttraj.format.locate": [],
     "weighttraj.format.reader": [
         "weighttraj.errors",
         "weighttraj.format.catalog",
         "weighttraj.format.layout",
+        "weighttraj.format.locate",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
@@ -151,6 +153,7 @@ ALLOWED = {
     "weighttraj.cli": [
         "door weighttraj",
         "weighttraj.errors",
+        "weighttraj.format.locate",
         "later weighttraj.collect.recipe",
         "later weighttraj.load",
         "later weighttraj.publish.report",

@@ -15,6 +15,7 @@ from rich.markup import escape
 
 import weighttraj as wt
 from weighttraj.errors import WeightTrajError
+from weighttraj.format.locate import locate
 
 app = tyro.extras.SubcommandApp()
 console = Console()
@@ -49,7 +50,7 @@ def _collect(args: _Collect) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _Returns:
     path: tyro.conf.Positional[Path]
-    """Data set."""
+    """Data set: a path, or the id of one that is found here."""
     episodes: int = 10
     """Episodes for each action mode; the same seeds for every policy."""
     every: int = 10
@@ -78,7 +79,7 @@ def _returns(args: _Returns) -> None:
         seed=args.seed,
     )
     dataset = wt.policies.fill_returns(
-        args.path, config, workers=args.workers, replace=args.replace, console=console
+        locate(args.path), config, workers=args.workers, replace=args.replace, console=console
     )
     for run in dataset:
         if run.evaluation is not None:
@@ -98,9 +99,10 @@ def _last_return(run: wt.Run) -> str:
 
 @app.command(name="show")
 def _show(
-    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set or run")],
+    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set (path or id) or run")],
 ) -> None:
     """Print what a data set or a run holds."""
+    path = locate(path)
     if (path / "dataset.json").is_file() or path.suffix == ".h5":
         print(wt.open(path))
         return
@@ -113,7 +115,7 @@ def _show(
 @dataclass(frozen=True, kw_only=True)
 class _Verify:
     path: tyro.conf.Positional[Path]
-    """Data set or run."""
+    """Data set (path or id) or run."""
     deep: bool = False
     """Decode every array, also where the manifest vouches for the bytes."""
     replay: int = 0
@@ -126,24 +128,26 @@ class _Verify:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _verify(args: _Verify) -> None:
     """Is it whole? Exit with 1 if something is missing, damaged or not what it says."""
-    problems = wt.verify(args.path, deep=args.deep)
+    path = locate(args.path)
+    problems = wt.verify(path, deep=args.deep)
     if args.replay and not problems:
-        problems += wt.collect.replay(args.path, args.replay, seed=args.seed)
-    _finish(args.path, problems, f"whole{_state_of(args.path)}")
+        problems += wt.collect.replay(path, args.replay, seed=args.seed)
+    _finish(path, problems, f"whole{_state_of(path)}")
 
 
 @app.command(name="lint")
 def _lint(
-    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set or run")],
+    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set (path or id) or run")],
 ) -> None:
     """Is it what it says it is? Look for duplicates, gaps, jumps; exit with 1 on findings."""
+    path = locate(path)
     _finish(path, [str(finding) for finding in wt.lint(path)], "nothing suspicious")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Repair:
     path: tyro.conf.Positional[Path]
-    """Data set or run."""
+    """Data set (path or id) or run."""
     cut: bool = False
     """Drop damaged snapshots and those after them; collecting again makes them anew."""
 
@@ -152,9 +156,10 @@ class _Repair:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _repair(args: _Repair) -> None:
     """Mend what can be mended without training, and say what is left to do."""
-    for step in wt.repair(args.path, cut=args.cut):
+    path = locate(args.path)
+    for step in wt.repair(path, cut=args.cut):
         print(step)
-    _finish(args.path, wt.verify(args.path), f"whole{_state_of(args.path)}")
+    _finish(path, wt.verify(path), f"whole{_state_of(path)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +182,7 @@ def _pack(args: _Pack) -> None:
 @dataclass(frozen=True, kw_only=True)
 class _Report:
     path: tyro.conf.Positional[Path]
-    """Data set or run."""
+    """Data set (path or id) or run."""
     out: Path = Path("report.html")
     """Page to be written: one file that opens from disk. An earlier report is replaced."""
     film: bool = True
@@ -196,7 +201,7 @@ def _report(args: _Report) -> None:
 
     print(
         report(
-            args.path,
+            locate(args.path),
             args.out,
             film=args.film,
             seed=args.seed,
@@ -224,7 +229,7 @@ class _Export:
 def _export(args: _Export) -> None:
     """Write a run for other programs."""
     if args.to == "hdf5":
-        print(wt.export_hdf5(args.path, args.out))
+        print(wt.export_hdf5(locate(args.path), args.out))
         return
     run = wt.open_run(args.path)
     if args.to == "npy":

@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.catalog import read_dataset_info
 from weighttraj.format.layout import ParamLayout
+from weighttraj.format.locate import locate
 from weighttraj.format.objects import FolderObjects
 from weighttraj.format.schema import (
     RETURNS,
@@ -431,16 +432,17 @@ class Dataset:
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a data set: a folder, or one HDF5 file (``.h5``; needs the extra ``files``).
+    """Open a data set: a folder, one HDF5 file (``.h5``; needs the extra ``files``), or an id.
 
-    A data set that is still being collected opens too, with the runs that exist so far.
+    Ids are looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH`` and in those of a clone. A
+    data set that is still being collected opens too, with the runs that exist so far.
 
     Raises:
         FileNotFoundError: there is no data set at the path.
         FormatError: it is none of this format, or a run is a link.
         DamageError: it is complete but lacks a run that it lists.
     """
-    path = Path(path)
+    path = locate(path)
     if path.suffix == ".h5":
         from weighttraj.format.hdf5 import open_hdf5
 

@@ -1,0 +1,45 @@
+"""Where a data set lies that is named by its id."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
+"""Environment variable: folders that hold data sets, as in PATH."""
+
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+def locate(path: str | Path) -> Path:
+    """The path of a data set: the path itself, or where the data set of an id lies.
+
+    An id is looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH``, then in ``datasets`` of the
+    clone that this package was installed from. There, ``<id>`` or ``<id>/data`` is the data set.
+
+    Raises:
+        FileNotFoundError: the id is in none of them.
+    """
+    name = str(path)
+    if Path(path).exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
+        return Path(path)
+    places = [folder / name / part for folder in folders() for part in ("", "data")]
+    for place in places:
+        if (place / "dataset.json").is_file():
+            return place
+    looked = ", ".join(str(folder) for folder in folders()) or "no folder"
+    raise FileNotFoundError(
+        f"no data set or run at {name}, and none of that id in {looked}; "
+        f"set {VARIABLE} to the folders that hold your data sets"
+    )
+
+
+def folders() -> list[Path]:
+    """Folders in which data sets are looked for, the first one first."""
+    named = os.environ.get(VARIABLE, "").split(os.pathsep)
+    clone = Path(__file__).parents[2] / "datasets"
+    return [Path(name).expanduser() for name in named if name] + [clone] * clone.is_dir()
+
+
+__all__ = ["VARIABLE", "folders", "locate"]
