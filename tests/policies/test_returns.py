@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -7,14 +8,18 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from filelock import FileLock
+from rich.console import Console
 
 import weighttraj as wt
 from weighttraj.errors import FormatError, PolicyError, StoreLockedError
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
 from weighttraj.policies.returns import play_rows
 
@@ -231,6 +236,19 @@ def test_only_one_at_a_time(dataset: Path) -> None:
         pytest.raises(StoreLockedError, match="another process is changing"),
     ):
         fill_returns(dataset, CONFIG)
+
+
+def test_runs_that_are_about_to_change_are_left_for_later(dataset: Path) -> None:
+    with zipfile.ZipFile(dataset / "runs/seed0001.zarr.zip") as archive:
+        archive.extractall(dataset / "runs/seed0001.zarr")
+    info = read_dataset_info(dataset)
+    folder = replace(info.runs[1], path="runs/seed0001.zarr")
+    runs = (info.runs[0], folder, *info.runs[2:])
+    write_dataset_info(dataset, replace(info, runs=runs, status="collecting"))
+    screen = io.StringIO()
+    filled = fill_returns(dataset, CONFIG, console=Console(file=screen, width=200))
+    assert "left for later: seed0001" in screen.getvalue()
+    assert [run.evaluation is None for run in filled] == [False, True, False, False]
 
 
 def test_settings_that_evaluate_nothing_are_refused(dataset: Path) -> None:

@@ -36,6 +36,7 @@ from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, 
 from weighttraj.format.catalog import MANIFEST
 from weighttraj.format.integrity import seal, unseal
 from weighttraj.format.objects import replace_file
+from weighttraj.format.storage import PACKED
 from weighttraj.policies.batch import load_policies
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 from weighttraj.policies.simulators import GymnasiumSimulator
@@ -283,7 +284,10 @@ class _Journal:
 
 
 def _finished(dataset: Dataset, console: Console) -> list[Run]:
-    done = [run for run in dataset if run.info.status != "collecting"]
+    """Runs that will not change; a folder that is packed, but not yet listed so, is about to go."""
+    packed = {run.id for run in dataset if run.path.with_name(f"{run.path.name}{PACKED}").is_file()}
+    ended = [run for run in dataset if run.info.status != "collecting"]
+    done = [run for run in ended if run.id not in packed]
     if skipped := [run.id for run in dataset if run not in done]:
         console.print(f"still being collected, so left for later: {', '.join(skipped)}")
     return done
