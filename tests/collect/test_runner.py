@@ -242,8 +242,14 @@ def test_a_failing_run_leaves_the_others_whole(tmp_path: Path, workers: int) -> 
     (out / "runs/seed0001.zarr/zarr.json").write_text('{"attributes": {}}')
     with pytest.raises(CollectError, match=r"(?s)1 of 3 runs failed.*seed 1.*run of weighttraj"):
         collect(recipe, out, workers=workers)
-    assert wt.open_run(out / "runs/seed0002.zarr").info.status == "complete"
-    assert wt.open_run(out / "runs/seed0000.zarr").info.status == "complete"
+    for name in ("seed0000", "seed0002"):
+        assert wt.open_run(out / f"runs/{name}.zarr").info.status == "complete"
+        assert not (out / f"runs/{name}.zarr").exists()  # packed, listed so, and gone
+    assert [entry.path.endswith(".zip") for entry in read_dataset_info(out).runs] == [
+        True,
+        False,
+        True,
+    ]
 
 
 def test_no_workers_is_refused(tmp_path: Path) -> None:

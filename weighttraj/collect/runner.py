@@ -73,6 +73,8 @@ def collect(
         again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
     failures = [f for f in failures if not isinstance(f[1], ReplayError)]
     failures += _run(again, workers, console)
+    with _lock(out):
+        _settle(out)
     if failures:
         raise CollectError(
             f"{len(failures)} of {len(wanted)} runs failed; the others are whole",
@@ -80,8 +82,6 @@ def collect(
             where=out,
             do="mend the cause and give the same command again: it goes on where it stopped",
         )
-    with _lock(out):
-        _settle(out)
     return open_dataset(out)
 
 
