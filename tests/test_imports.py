@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[1]
 FORMAT = "weighttraj.format"
 ALLOWED = {
     "weighttraj.errors": [],
+    "weighttraj.threads": [],
     "weighttraj.format.layout": ["weighttraj.errors"],
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
     "weighttraj.format.objects": ["weighttraj.errors"],
@@ -110,6 +111,7 @@ ALLOWED = {
     "weighttraj.format": [FORMAT],
     "weighttraj.environments": ["weighttraj.errors"],
     "weighttraj.collect": [
+        "weighttraj.threads",
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
@@ -118,6 +120,7 @@ ALLOWED = {
         "weighttraj.policies.simulators",
     ],
     "weighttraj.policies": [
+        "weighttraj.threads",
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
@@ -125,6 +128,7 @@ ALLOWED = {
     ],
     "weighttraj.publish.film": [FORMAT, "weighttraj.publish"],
     "weighttraj.publish.episodes": [
+        "weighttraj.threads",
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,

@@ -230,6 +230,19 @@ def test_returns_of_other_physics_are_not_mixed(
         fill_returns(dataset, ReturnsConfig(episodes=2, every=7))
 
 
+def test_the_current_folder_can_be_a_data_set(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(dataset)
+    assert fill_returns(".", CONFIG).runs[0].evaluation is not None
+
+
+def test_where_there_is_no_data_set_nothing_is_left(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no data set at"):
+        fill_returns(tmp_path / "no" / "where", CONFIG)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_only_one_at_a_time(dataset: Path) -> None:
     with (
         FileLock(dataset.parent / ".small.lock"),

@@ -218,8 +218,13 @@ def describe_env(model: OnPolicyAlgorithm, wrappers: tuple[str, ...]) -> EnvInfo
     )
 
 
-def describe_algorithm(model: OnPolicyAlgorithm) -> Algorithm:
-    """Name and hyper-parameters; schedules become tables over the progress that remains."""
+def describe_algorithm(model: OnPolicyAlgorithm, collector: str = "") -> Algorithm:
+    """Name and hyper-parameters; schedules become tables over the progress that remains.
+
+    Args:
+        model: SB3's model.
+        collector: who trains in its place; empty: SB3.
+    """
     values = {n: _plain(getattr(model, n)) for n in HYPERPARAMETERS if hasattr(model, n)}
     for name in ("lr_schedule", "clip_range", "clip_range_vf"):
         schedule = getattr(model, name, None)
@@ -230,9 +235,11 @@ def describe_algorithm(model: OnPolicyAlgorithm) -> Algorithm:
         "class": type(model.policy.optimizer).__name__,
         **_plain({k: v for k, v in model.policy.optimizer.defaults.items() if v is not None}),
     }
-    version = importlib.metadata.version("stable-baselines3")
+    sb3 = f"stable-baselines3 {importlib.metadata.version('stable-baselines3')}"
     return Algorithm(
-        name=type(model).__name__, library=f"stable-baselines3 {version}", hyperparameters=values
+        name=type(model).__name__,
+        library=f"{collector}, as {sb3}" if collector else sb3,
+        hyperparameters=values,
     )
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -23,6 +22,7 @@ from weighttraj.collect.recipe import Recipe, Store
 from weighttraj.collect.recorder import Recorder
 from weighttraj.format.packing import pack
 from weighttraj.format.storage import read_info
+from weighttraj.threads import one_torch_thread
 
 Report = Callable[[int, int], None]
 """Called with a seed and its environment steps so far."""
@@ -69,7 +69,7 @@ def collect_block(tasks: Sequence[Task], report: Report) -> list[Failure]:
     for task in tasks:
         with _noted(task, failures):
             unfinished += [] if _is_complete(task.path) else [task]
-    with _one_thread():
+    with one_torch_thread():
         if tasks[0].recipe.collect.collector == "population":
             failures += _train_together(unfinished, report)
         else:
@@ -109,8 +109,7 @@ def open_recorder(
         FormatError: the run at the path was started with other settings.
         ReplayError: it begins otherwise.
     """
-    model, algorithm = origin.model, describe_algorithm(origin.model)
-    library = f"weighttraj's population, as {algorithm.library}"
+    model = origin.model
     info = describe_run(
         model,
         find_normalizers(cast(VecEnv, model.get_env())),
@@ -123,7 +122,7 @@ def open_recorder(
     )
     return Recorder(
         path,
-        replace(info, algorithm=replace(algorithm, library=library)),
+        replace(info, algorithm=describe_algorithm(model, "weighttraj's population")),
         lambda: population.read(learner, critic=store.critic, moments=store.optimizer_moments),
         every=store.every,
         steps_per_epoch=model.n_steps // model.batch_size,
@@ -244,16 +243,6 @@ def _noted(task: Task, failures: list[Failure]) -> Iterator[None]:
         yield
     except Exception as error:
         failures.append((task, error))
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 __all__ = ["Failure", "Report", "Task", "blocks_of", "collect_block", "open_recorder"]

@@ -33,7 +33,7 @@ from rich.progress import (
 
 from weighttraj.errors import PolicyError, StoreLockedError
 from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, store_returns
-from weighttraj.format.catalog import MANIFEST
+from weighttraj.format.catalog import MANIFEST, read_dataset_info
 from weighttraj.format.integrity import seal, unseal
 from weighttraj.format.objects import replace_file
 from weighttraj.format.storage import PACKED
@@ -126,6 +126,7 @@ def fill_returns(
         The data set, opened again.
 
     Raises:
+        FileNotFoundError: there is no data set at the path.
         PolicyError: a run has returns of another evaluation, or cannot be evaluated.
         StoreLockedError: somebody else is doing the same.
         KeyboardInterrupt: it was stopped; what was played stays.
@@ -134,7 +135,8 @@ def fill_returns(
     console = console or Console(quiet=True)
     if workers < 1:
         raise PolicyError("nobody to do the work", expected="workers at least 1", got=workers)
-    with _only_one(path):
+    read_dataset_info(path)  # before a lock is put beside it: is there one?
+    with _only_one(path.resolve()):
         runs = _finished(open_dataset(path), console)
         works = [_Work(run, path / ".returns", config, replace=replace) for run in runs]
         works = [work for work in works if work.missing or work.unsaved]

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import cached_property
 from types import TracebackType
 from typing import Any, NamedTuple, overload
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from weighttraj import environments
 from weighttraj.errors import PolicyError
@@ -21,6 +18,7 @@ from weighttraj.format import EnvInfo, PolicySpec, Run
 from weighttraj.policies.batch import PolicyBatch
 from weighttraj.policies.policy import Policy
 from weighttraj.policies.simulators import Simulator, make_simulator
+from weighttraj.threads import one_torch_thread
 
 _BLOCK = 256
 """Policies that play at once: enough for the physics to outweigh Python."""
@@ -114,14 +112,25 @@ class Evaluator:
             return EpisodeReturns(returns[0], lengths[0])
         size = self._size(len(policy))
         blocks = [policy[start : start + size] for start in range(0, len(policy), size)]
+        free: queue.SimpleQueue[Simulator] = queue.SimpleQueue()  # simulators that no thread uses
+        for simulator in self._simulators:
+            free.put(simulator)
+
+        def play(block: PolicyBatch) -> EpisodeReturns:
+            simulator = free.get()
+            try:
+                return self._play(simulator, block, deterministic)
+            finally:
+                free.put(simulator)
+
         # Torch's own threads would wait for their next piece in a loop, and take the time of the
         # physics: each thread of ours plays a block with one.
         with (
-            _one_torch_thread(),
+            one_torch_thread(),
             environments.quiet_mujoco(),
             ThreadPoolExecutor(len(self._simulators)) as pool,
         ):
-            played = list(pool.map(lambda block: self._play(block, deterministic), blocks))
+            played = list(pool.map(play, blocks))
         returns, lengths = (np.concatenate(x) for x in zip(*played, strict=True))
         return EpisodeReturns(returns, lengths)
 
@@ -149,14 +158,6 @@ class Evaluator:
         others = self._threads - 1 if first.most is None else 0
         return [first, *(make_simulator(self._make, self.seeds) for _ in range(others))]
 
-    @cached_property
-    def _free(self) -> queue.SimpleQueue[Simulator]:
-        """Simulators that no thread is using."""
-        free: queue.SimpleQueue[Simulator] = queue.SimpleQueue()
-        for simulator in self._simulators:
-            free.put(simulator)
-        return free
-
     def _size(self, policies: int) -> int:
         """Policies that a thread plays at once."""
         most = min(self._block, self._simulators[0].most or self._block)
@@ -167,17 +168,10 @@ class Evaluator:
         limits = {} if limit is None else {"max_episode_steps": limit}
         return environments.make(self._info.id, **limits, **self._info.kwargs)
 
-    def _play(self, policies: PolicyBatch, deterministic: bool) -> EpisodeReturns:
-        """Returns and lengths (policy, episode) of a block of policies."""
-        simulator = self._free.get()
-        try:
-            return self._play_in(simulator, policies, deterministic)
-        finally:
-            self._free.put(simulator)
-
-    def _play_in(
+    def _play(
         self, simulator: Simulator, policies: PolicyBatch, deterministic: bool
     ) -> EpisodeReturns:
+        """Returns and lengths (policy, episode) of a block of policies."""
         shape = (len(policies), len(self.seeds))
         returns, lengths = np.zeros(shape), np.zeros(shape, np.int64)
         first = simulator.reset(len(policies))
@@ -295,13 +289,3 @@ def _batch_of(policy: Policy) -> PolicyBatch:
     stats = policy.stats
     mean, var = (None, None) if stats is None else (stats.mean[None], stats.var[None])
     return PolicyBatch(policy.spec, policy.layout, policy.weights[None], policy.obs_norm, mean, var)
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

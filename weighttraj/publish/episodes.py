@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Float64, Int64
 
 from weighttraj import environments
@@ -19,6 +16,7 @@ from weighttraj.format import EnvInfo, Run
 from weighttraj.policies import Evaluator, Policy, env_of, load_policies
 from weighttraj.publish.curves import Curve, mean_returns, thin
 from weighttraj.publish.scene import Placement, Pose, View, placement_of, pose_of, view_of
+from weighttraj.threads import one_torch_thread
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Where a return is on its way from the lowest to the highest, at each moment after the start."""
@@ -194,7 +192,7 @@ class Stage:
         places = [self._placement()]
         rewards: list[float] = []
         terminated = truncated = False
-        with _one_thread(), environments.quiet_mujoco():
+        with one_torch_thread(), environments.quiet_mujoco():
             while not (terminated or truncated) and len(rewards) < MAX_STEPS:
                 action = self._action(policy, observation)
                 observation, reward, terminated, truncated, _ = self.env.step(action)
@@ -227,17 +225,6 @@ class Stage:
                 do="install the version of the environment that run.info.provenance names",
             )
         return action
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Networks of one observation are too small to share: threads would wait for one another."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _env_of(run: Run) -> EnvInfo:

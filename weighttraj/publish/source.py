@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from weighttraj.errors import FormatError
-from weighttraj.format import Run, open_dataset, open_run
+from weighttraj.format import Algorithm, Run, open_dataset, open_run
 from weighttraj.format.schema import DatasetInfo
 from weighttraj.publish.curves import final_return
 
@@ -146,10 +146,13 @@ def _values(runs: Iterable[Run], value: Callable[[Run], str]) -> str:
 
 
 def _algorithm(run: Run) -> str:
-    algorithm = run.info.algorithm
-    if algorithm is None:
-        return ""
-    return f"{algorithm.name} ({algorithm.library})" if algorithm.library else algorithm.name
+    match run.info.algorithm:
+        case None:
+            return ""
+        case Algorithm(name=name, library=""):
+            return name
+        case Algorithm(name=name, library=library):
+            return f"{name} ({library})"
 
 
 def _runs(source: Source) -> str:
