@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,3 +59,19 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with FileLock(root / "small.lock"):
         collect(SMALL_RECIPE, root / "small")
     return root / "small"
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 64 KiB; ``grow`` makes it larger."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(path)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        mounted = False
+    if not mounted:
+        pytest.skip("no small disk can be mounted here")
+    yield path
+    subprocess.run(["umount", "-l", str(path)], check=True)  # noqa: S607

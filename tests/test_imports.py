@@ -17,6 +17,12 @@ FORMAT = "weighttraj.format"
 ALLOWED = {
     "weighttraj.errors": [],
     "weighttraj.threads": [],
+    "weighttraj.engine": ["weighttraj.errors", "weighttraj.engine"],
+    "weighttraj.engine.choose": [
+        "weighttraj.errors",
+        "weighttraj.engine",
+        "later weighttraj.engine.cluster",
+    ],
     "weighttraj.format.layout": ["weighttraj.errors"],
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
     "weighttraj.format.objects": ["weighttraj.errors"],
@@ -112,6 +118,7 @@ ALLOWED = {
     "weighttraj.environments": ["weighttraj.errors"],
     "weighttraj.collect": [
         "weighttraj.threads",
+        "weighttraj.engine",
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
@@ -121,6 +128,7 @@ ALLOWED = {
     ],
     "weighttraj.policies": [
         "weighttraj.threads",
+        "weighttraj.engine",
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
@@ -275,6 +283,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
         "mujoco",
         "matplotlib",
         "pandas",
+        "distributed",
     ]
     assert run(f"HEAVY = {heavy}; {code}") == "[]"
 
@@ -306,6 +315,7 @@ except ImportError as error:
             "files",
         ),
         ("torch", "wt.load", "sb3"),
+        ("distributed", "import weighttraj.engine.cluster", "dask"),
         ("matplotlib", "import weighttraj.publish", "report"),
         ("jinja2", "from weighttraj.publish.report import report", "report"),
         ("safetensors", "import tipl", "tipl"),

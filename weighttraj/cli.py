@@ -30,7 +30,9 @@ class _Collect:
     seeds: str | None = None
     """Only these seeds: 3, or a range 0:50 (the end excluded). Default: the recipe's."""
     workers: int = 1
-    """Runs that are trained at the same time, each in a process with one thread."""
+    """Processes, each with one thread, that train a run, or a population, at a time."""
+    scheduler: str | None = None
+    """Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this machine."""
 
 
 @app.command(name="collect")
@@ -42,7 +44,14 @@ def _collect(args: _Collect) -> None:
     recipe = wt.collect.read_recipe(args.recipe)
     out = args.out or Path("data") / recipe.id
     seeds = None if args.seeds is None else parse_seeds(args.seeds)
-    dataset = wt.collect.collect(recipe, out, seeds=seeds, workers=args.workers, console=console)
+    dataset = wt.collect.collect(
+        recipe,
+        out,
+        seeds=seeds,
+        workers=args.workers,
+        scheduler=args.scheduler,
+        console=console,
+    )
     print(dataset)
     print(f"data set in {out}")
 
@@ -63,6 +72,8 @@ class _Returns:
     """Seed of the first episode."""
     workers: int = 1
     """Processes, each with one thread."""
+    scheduler: str | None = None
+    """Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this machine."""
     replace: bool = False
     """Evaluate anew what has returns of other episodes or other versions of the physics."""
 
@@ -79,7 +90,12 @@ def _returns(args: _Returns) -> None:
         seed=args.seed,
     )
     dataset = wt.policies.fill_returns(
-        locate(args.path), config, workers=args.workers, replace=args.replace, console=console
+        locate(args.path),
+        config,
+        workers=args.workers,
+        scheduler=args.scheduler,
+        replace=args.replace,
+        console=console,
     )
     for run in dataset:
         if run.evaluation is not None:

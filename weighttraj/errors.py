@@ -84,6 +84,10 @@ class CacheError(WeightTrajError, OSError):
     """The cache of decoded weights cannot be used: no space, or no right to write."""
 
 
+class EngineError(WeightTrajError, RuntimeError):
+    """Tasks that could not be done where they were to be done."""
+
+
 class LoaderError(WeightTrajError, ValueError):
     """A loader's saved state does not fit the loader it is given to."""
 

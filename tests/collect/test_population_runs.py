@@ -20,6 +20,8 @@ import pytest
 from rich.console import Console
 
 import weighttraj as wt
+from tests.collect.test_runner import assert_same_arrays, committed
+from tests.disk import grow
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe, replay
 from weighttraj.collect.recipe import Collect, Seeds
@@ -33,12 +35,6 @@ QUICK = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1]), collect=Collect(collect
 def of_seed(dataset: wt.Dataset, seed: int) -> wt.Run:
     (run,) = dataset.select(seed=seed)
     return run
-
-
-def assert_same_bytes(run: wt.Run, other: wt.Run) -> None:
-    assert set(run.arrays) == set(other.arrays)
-    for name in run.arrays:
-        assert np.array_equal(run[name][:], other[name][:], equal_nan=True), name
 
 
 TOML = """
@@ -98,14 +94,7 @@ def test_a_killed_population_goes_on_in_any_grouping(quick: Path, tmp_path: Path
     dataset = wt.open(out)
     assert wt.verify(out) == []
     for seed in (0, 1):
-        assert_same_bytes(of_seed(dataset, seed), of_seed(wt.open(quick), seed))
-
-
-def committed(path: Path) -> int:
-    if not (path / "zarr.json").exists():
-        return 0
-    attributes = json.loads((path / "zarr.json").read_text())["attributes"]
-    return int(attributes["weighttraj"]["n_committed"])
+        assert_same_arrays(of_seed(dataset, seed), of_seed(wt.open(quick), seed))
 
 
 def test_ctrl_c_stops_every_population(tmp_path: Path) -> None:
@@ -150,7 +139,7 @@ def test_one_that_does_not_repeat_itself_starts_over_alone(quick: Path, tmp_path
     assert "starting over as seed0000-2" in screen.getvalue()
     assert {run.id for run in dataset} == {"seed0000-2", "seed0001"}
     for seed in (0, 1):
-        assert_same_bytes(of_seed(dataset, seed), of_seed(wt.open(quick), seed))
+        assert_same_arrays(of_seed(dataset, seed), of_seed(wt.open(quick), seed))
 
 
 def test_a_run_that_cannot_be_written_leaves_the_others_whole(tmp_path: Path) -> None:
@@ -165,6 +154,22 @@ def test_a_run_that_cannot_be_written_leaves_the_others_whole(tmp_path: Path) ->
         collect(recipe, out)
     for seed in (0, 2):
         assert wt.open_run(out / f"runs/seed{seed:04d}.zarr").info.status == "complete"
+
+
+def test_a_full_disk_leaves_finished_runs_as_they_are(quick: Path, disk: Path) -> None:
+    out = disk / "data"
+    grow(disk, "4m")
+    collect(replace(QUICK, seeds=Seeds(train=[0])), out)
+    finished = (out / "runs/seed0000.zarr.zip").read_bytes()
+    used = sum(p.stat().st_blocks * 512 for p in disk.rglob("*"))
+    grow(disk, str(used + (100 << 10)))
+    with pytest.raises((CollectError, OSError), match="No space left on device"):
+        collect(QUICK, out)
+    assert (out / "runs/seed0000.zarr.zip").read_bytes() == finished
+    grow(disk, "4m")
+    for run, same in zip(collect(QUICK, out), wt.open(quick), strict=True):
+        assert_same_arrays(run, same)
+    assert wt.verify(out, deep=True) == []
 
 
 LAYOUT = wt.ParamLayout.of({"w": ((1,), "weight", ("a",))})

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +21,9 @@ from rich.console import Console
 import weighttraj as wt
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe
-from weighttraj.collect.recipe import Seeds, parse_seeds
-from weighttraj.errors import CollectError, RecipeError
+from weighttraj.collect.recipe import Seeds, Store, parse_seeds
+from weighttraj.collect.tasks import Task, collect_block
+from weighttraj.errors import CollectError, EngineError, RecipeError
 from weighttraj.format import RunEntry
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
@@ -72,6 +75,12 @@ def test_our_recipes_can_be_read() -> None:
         (("[2, 3]", "[1, 3]"), "seed 1 in train and in test"),
         (('"0:2"', '"0-2"'), 'a range such as "0:30"'),
         (("id =", "id = ="), "no TOML"),
+        (("every = 2", "every = 0"), r"(?s)every from 1 to the 96 gradient .*store.every = 0"),
+        (("every = 2", "every = 97"), r"(?s)every from 1 to the 96 gradient .*store.every = 97"),
+        (("= 768", "= 63"), r"(?s)at least one rollout, n_steps = 64.*total_timesteps = 63"),
+        (("block = 8", "block = 0"), "store.block at least 1"),
+        (("batch_size = 16", "batch_size = 65"), r"(?s)batch_size from 2 to n_steps.*= 65"),
+        (("n_epochs = 2", "n_epochs = 0\ngamma = 2.0"), r"(?s)n_epochs at.*gamma from 0 to 1"),
     ],
 )
 def test_a_bad_recipe_is_one_clear_error(
@@ -102,12 +111,54 @@ def one_seed(seed: int = 0) -> Recipe:
     return replace(SMALL_RECIPE, seeds=Seeds(train=[seed]))
 
 
-def test_processes_give_the_same_bytes(small_dataset: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("engine", [{}, {"scheduler": "local"}], ids=["processes", "cluster"])
+def test_engines_give_the_same_bytes(
+    small_dataset: Path, tmp_path: Path, engine: dict[str, str]
+) -> None:
     recipe = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1]))
-    dataset = collect(recipe, tmp_path / "dataset", workers=2)
+    dataset = collect(recipe, tmp_path / "dataset", workers=2, **engine)
     for run, same in zip(dataset, wt.open(small_dataset), strict=False):
-        assert np.array_equal(run["digest"][:], same["digest"][:])
-        assert np.array_equal(run["obs_norm/mean"][:], same["obs_norm/mean"][:])
+        assert_same_arrays(run, same)
+
+
+def assert_same_arrays(run: wt.Run, other: wt.Run) -> None:
+    assert set(run.arrays) == set(other.arrays)
+    for name in run.arrays:
+        assert np.array_equal(run[name][:], other[name][:], equal_nan=True), name
+
+
+def test_what_a_killed_worker_began_is_finished_by_another(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "dataset"
+    path = out / "runs/seed0001.zarr"
+    killed = []
+
+    def kill() -> None:
+        deadline = time.monotonic() + 120
+        while committed(path) < 8 and time.monotonic() < deadline:
+            time.sleep(0.005)
+        for process in multiprocessing.active_children():
+            process.kill()
+            killed.append(committed(path))
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    dataset = collect(replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1])), out, workers=2)
+    killer.join()
+    assert 1 <= len(killed) <= 2
+    assert killed[0] < 49
+    assert wt.verify(out) == []
+    for run, same in zip(dataset, wt.open(small_dataset), strict=False):
+        assert_same_arrays(run, same)
+
+
+def committed(path: Path) -> int:
+    """Committed snapshots of a run that another process writes."""
+    if not (path / "zarr.json").exists():
+        return 0
+    attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+    return int(attributes["weighttraj"]["n_committed"])
 
 
 def test_collecting_again_does_nothing(tmp_path: Path) -> None:
@@ -135,20 +186,15 @@ def test_a_killed_collector_goes_on_where_it_was(
     command += ["--out", str(out), "--seeds", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     path = out / "runs/seed0000.zarr"
-    committed = 0
     deadline = time.monotonic() + 120
-    while committed < 8 and process.poll() is None and time.monotonic() < deadline:
-        if (path / "zarr.json").exists():
-            committed = json.loads((path / "zarr.json").read_text())["attributes"]["weighttraj"][
-                "n_committed"
-            ]
+    while committed(path) < 8 and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     run = wt.open_run(path)
     whole = wt.open(small_dataset).runs[0]
-    assert 8 <= committed <= len(run) < 49
+    assert 8 <= len(run) < 49
     assert wt.verify(path) == []
     assert np.array_equal(run.weights[:], whole.weights[: len(run)])
 
@@ -159,8 +205,7 @@ def test_a_killed_collector_goes_on_where_it_was(
     assert not path.exists()
     run = wt.open_run(path)  # packed meanwhile
     assert run.info.status == "complete"
-    for name in whole.arrays:
-        assert np.array_equal(run[name][:], whole[name][:], equal_nan=True), name
+    assert_same_arrays(run, whole)
     assert wt.verify(path) == []
 
 
@@ -218,6 +263,25 @@ def test_a_run_that_does_not_repeat_itself_starts_over(small_dataset: Path, tmp_
     assert len(wt.open_run(out / "runs/seed0000.zarr")) == 3
 
 
+def test_a_recipe_without_seeds_collects_nothing(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="nothing to collect"):
+        collect(replace(SMALL_RECIPE, seeds=Seeds()), tmp_path / "dataset")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_impossible_settings_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="no such runs"):
+        collect(replace(one_seed(), store=Store(every=10**6)), tmp_path / "dataset")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
+    task = Task(recipe=one_seed(), seed=0, path=tmp_path / "elsewhere/runs/seed0000.zarr")
+    with pytest.raises(CollectError, match=r"(?s)does not see the data set.*all machines share"):
+        collect_block([task], lambda *_: None)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_another_recipe_does_not_touch_a_data_set(small_dataset: Path) -> None:
     other = replace(SMALL_RECIPE, ppo=replace(SMALL_RECIPE.ppo, gamma=0.9))
     with pytest.raises(
@@ -253,7 +317,7 @@ def test_a_failing_run_leaves_the_others_whole(tmp_path: Path, workers: int) -> 
 
 
 def test_no_workers_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CollectError, match="workers at least 1"):
+    with pytest.raises(EngineError, match="workers at least 1"):
         collect(one_seed(), tmp_path / "dataset", workers=0)
     assert list(tmp_path.iterdir()) == []
 

@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +32,7 @@ from tests.benchmarks.stress_format import (
     make_samples,
     whole,
 )
+from tests.disk import grow
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
 from weighttraj.errors import CollectError, StoreLockedError
@@ -97,26 +97,6 @@ def test_mutated_metadata_are_refused_by_an_error_of_ours(samples: Path) -> None
 
 
 # A full disk
-
-
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 64 KiB; ``grow`` makes it larger."""
-    path = tmp_path / "disk"
-    path.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(path)]
-    try:
-        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
-    except FileNotFoundError:
-        mounted = False
-    if not mounted:
-        pytest.skip("no small disk can be mounted here")
-    yield path
-    subprocess.run(["umount", "-l", str(path)], check=True)  # noqa: S607
-
-
-def grow(disk: Path, size: str) -> None:
-    subprocess.run(["mount", "-o", f"remount,size={size}", str(disk)], check=True)  # noqa: S607
 
 
 def test_collecting_goes_on_after_a_full_disk(reference: Path, disk: Path) -> None:

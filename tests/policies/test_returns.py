@@ -18,7 +18,8 @@ from filelock import FileLock
 from rich.console import Console
 
 import weighttraj as wt
-from weighttraj.errors import FormatError, PolicyError, StoreLockedError
+from weighttraj.engine import Tell
+from weighttraj.errors import EngineError, FormatError, PolicyError, StoreLockedError
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
 from weighttraj.policies.returns import play_rows
@@ -80,7 +81,7 @@ def test_what_is_stored_is_not_played_again(dataset: Path, monkeypatch: pytest.M
     fill_returns(dataset, CONFIG)
     objects = {p: p.read_bytes() for p in dataset.rglob("*") if p.is_file()}
     played = []
-    monkeypatch.setattr(returns, "play_rows", lambda task: played.append(task))
+    monkeypatch.setattr(returns, "play_rows", lambda task, _: played.append(task))
     fill_returns(dataset, CONFIG)
     assert played == []
     assert {p: p.read_bytes() for p in dataset.rglob("*") if p.is_file()} == objects
@@ -181,9 +182,9 @@ def _count(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """The snapshots of each block that is played from now on."""
     played: list[list[int]] = []
 
-    def play(task: returns._Task) -> EpisodeReturns:
+    def play(task: returns._Task, tell: Tell) -> EpisodeReturns:
         played.append(task.rows)
-        return play_rows(task)
+        return play_rows(task, tell)
 
     monkeypatch.setattr(returns, "play_rows", play)
     return played
@@ -194,10 +195,10 @@ def _stop_after(monkeypatch: pytest.MonkeyPatch, blocks: int) -> None:
     played = _count(monkeypatch)
     count = returns.play_rows
 
-    def play(task: returns._Task) -> EpisodeReturns:
+    def play(task: returns._Task, tell: Tell) -> EpisodeReturns:
         if len(played) == blocks:
             raise KeyboardInterrupt
-        return count(task)
+        return count(task, tell)
 
     monkeypatch.setattr(returns, "play_rows", play)
 
@@ -268,7 +269,7 @@ def test_settings_that_evaluate_nothing_are_refused(dataset: Path) -> None:
     for wrong in ({"episodes": 0}, {"every": 0}, {"first": -1}, {"modes": ()}, {"seed": -1}):
         with pytest.raises(PolicyError, match="evaluate nothing"):
             ReturnsConfig(**wrong)  # type: ignore[arg-type]
-    with pytest.raises(PolicyError, match="workers at least 1"):
+    with pytest.raises(EngineError, match="workers at least 1"):
         fill_returns(dataset, CONFIG, workers=0)
 
 

@@ -107,13 +107,60 @@ class Recipe:
                 found[seed] = split
         return found
 
+    def check(self) -> None:
+        """Check that there can be such runs, before any is begun.
+
+        Raises:
+            RecipeError: there cannot; all that is wrong is said at once.
+        """
+        ppo, store = self.ppo, self.store
+        units = (*ppo.net_arch, *(ppo.critic_arch or (1,)))
+        steps = ppo.total_timesteps // max(1, ppo.n_steps) * ppo.n_epochs
+        steps *= -(-ppo.n_steps // max(1, ppo.batch_size))
+        holds = {
+            "ppo.net_arch": (bool(ppo.net_arch) and min(units) >= 1, "layers of at least 1 unit"),
+            "ppo.n_steps": (ppo.n_steps >= 2, "at least 2"),
+            "ppo.total_timesteps": (
+                ppo.total_timesteps >= max(1, ppo.n_steps),
+                f"at least one rollout, n_steps = {ppo.n_steps}",
+            ),
+            "ppo.batch_size": (2 <= ppo.batch_size <= ppo.n_steps, "from 2 to n_steps"),
+            "ppo.n_epochs": (ppo.n_epochs >= 1, "at least 1"),
+            "ppo.learning_rate": (ppo.learning_rate > 0, "above 0"),
+            "ppo.gamma": (0 <= ppo.gamma <= 1, "from 0 to 1"),
+            "ppo.gae_lambda": (0 <= ppo.gae_lambda <= 1, "from 0 to 1"),
+            "collect.population": (self.collect.population >= 1, "at least 1"),
+            "store.every": (
+                store.every >= 1 and (store.every <= steps or not steps),
+                f"from 1 to the {steps} gradient steps of a run",
+            ),
+            "store.block": (store.block >= 1, "at least 1"),
+            "store.probe_observations": (
+                0 <= store.probe_observations <= ppo.n_steps,
+                "from 0 to n_steps",
+            ),
+        }
+        wrong = {name: expected for name, (fine, expected) in holds.items() if not fine}
+        if wrong:
+            raise RecipeError(
+                "there can be no such runs",
+                expected=", ".join(f"{name} {expected}" for name, expected in wrong.items()),
+                got=", ".join(f"{name} = {self._value(name)}" for name in wrong),
+                where=f"recipe {self.id!r}",
+            )
+        self.splits()
+
+    def _value(self, name: str) -> Any:
+        table, _, key = name.partition(".")
+        return getattr(getattr(self, table), key)
+
 
 def read_recipe(path: str | Path) -> Recipe:
     """Read a recipe.
 
     Raises:
         FileNotFoundError: there is no such file.
-        RecipeError: it is no TOML, has unknown keys, or values of the wrong type.
+        RecipeError: it is no TOML, has unknown keys, values of the wrong type or impossible ones.
     """
     path = Path(path)
     try:
@@ -127,14 +174,7 @@ def read_recipe(path: str | Path) -> Recipe:
         raise RecipeError(
             "the recipe has a value of the wrong type", got=error, where=path
         ) from error
-    recipe.splits()
-    if recipe.collect.population < 1:
-        raise RecipeError(
-            "a population of nobody",
-            expected="population at least 1",
-            got=recipe.collect.population,
-            where=f"{path}, [collect]",
-        )
+    recipe.check()
     return recipe
 
 

@@ -1,17 +1,11 @@
-"""From a recipe to a data set: runs spread over processes, and on again where it stopped."""
+"""From a recipe to a data set: runs spread over workers, and on again where it stopped."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
-import queue
 import shutil
-import signal
-import threading
 from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -23,7 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from weighttraj.collect.population import check_config
 from weighttraj.collect.recipe import Collect, Recipe
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
-from weighttraj.errors import CollectError, ReplayError, WeightTrajError
+from weighttraj.engine import Engine, engine_of
+from weighttraj.errors import CollectError, RecipeError, ReplayError, WeightTrajError
 from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_dataset
 from weighttraj.format.catalog import MANIFEST, read_dataset_info, write_dataset_info
 from weighttraj.format.integrity import seal
@@ -36,6 +31,7 @@ def collect(
     *,
     seeds: list[int] | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
     console: Console | None = None,
 ) -> Dataset:
     """Collect the runs of a recipe that do not exist yet.
@@ -49,30 +45,42 @@ def collect(
         out: folder of the data set.
         seeds: only these; seeds that the recipe does not name belong to no split.
         workers: processes; 1 means this one. Each trains one run at a time, or a population.
+        scheduler: address of a Dask scheduler whose workers do it instead, or ``local``; see
+            ``weighttraj.engine``. The bytes are the same.
         console: where progress is shown; None: nowhere.
 
     Raises:
         CollectError: the folder holds another data set, a run failed, or a population cannot train
             with the recipe's settings.
-        RecipeError: the recipe contradicts itself.
+        EngineError: there are no workers, or no scheduler answers.
+        RecipeError: there can be no such runs, or none are asked for.
         KeyboardInterrupt: it was stopped; what was committed stays.
     """
-    if workers < 1:
-        raise CollectError("nobody to do the work", expected="workers at least 1", got=workers)
+    recipe.check()
+    wanted = set(recipe.splits() if seeds is None else seeds)
+    if not wanted:
+        raise RecipeError(
+            "there is nothing to collect",
+            expected="seeds, in the recipe's [seeds] or from --seeds",
+            where=f"recipe {recipe.id!r}",
+        )
     if recipe.collect.collector == "population":
         check_config(recipe.ppo)
-    out = Path(out)
+    out = Path(out).absolute()
     console = console or Console(quiet=True)
-    out.mkdir(parents=True, exist_ok=True)
-    with _lock(out):
-        info = _prepare(recipe, out, seeds)
-    wanted = set(recipe.splits() if seeds is None else seeds)
-    tasks, failures = _plan(recipe, out, [run for run in info.runs if run.seed in wanted], console)
-    failures += _run(tasks, workers, console)
-    with _lock(out):
-        again = [_start_over(out, task, error, console) for task, error in _mismatches(failures)]
-    failures = [f for f in failures if not isinstance(f[1], ReplayError)]
-    failures += _run(again, workers, console)
+    with engine_of(workers, scheduler) as engine:
+        out.mkdir(parents=True, exist_ok=True)
+        with _lock(out):
+            info = _prepare(recipe, out, seeds)
+        entries = [run for run in info.runs if run.seed in wanted]
+        tasks, failures = _plan(recipe, out, entries, console)
+        failures += _run(tasks, engine, console)
+        with _lock(out):
+            again = [
+                _start_over(out, task, error, console) for task, error in _mismatches(failures)
+            ]
+        failures = [f for f in failures if not isinstance(f[1], ReplayError)]
+        failures += _run(again, engine, console)
     with _lock(out):
         _settle(out)
     if failures:
@@ -154,78 +162,19 @@ def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _run(tasks: list[Task], workers: int, console: Console) -> list[Failure]:
+def _run(tasks: list[Task], engine: Engine, console: Console) -> list[Failure]:
     """Do the tasks; return those that failed."""
     if not tasks:
         return []
-    blocks = blocks_of(tasks, workers)
-    with _progress(tasks, console) as report:
-        if workers == 1:
-            return [failure for block in blocks for failure in collect_block(block, report)]
-        return _run_in_processes(blocks, workers, report)
-
-
-def _run_in_processes(blocks: list[list[Task]], workers: int, report: Report) -> list[Failure]:
-    context = multiprocessing.get_context("spawn")
     failures: list[Failure] = []
-    with (
-        _noted_interrupts() as interrupted,
-        context.Manager() as manager,
-        # Interrupts are the business of this process: it tells the others to stop.
-        ProcessPoolExecutor(
-            min(workers, len(blocks)),
-            mp_context=context,
-            initializer=signal.signal,
-            initargs=(signal.SIGINT, signal.SIG_IGN),
-        ) as pool,
-    ):
-        steps, stop = manager.Queue(), manager.Event()
-        futures: dict[Future[list[Failure]], list[Task]] = {
-            pool.submit(_collect_in_process, block, steps, stop): block for block in blocks
-        }
-        while not interrupted.is_set() and not (
-            all(future.done() for future in futures) and steps.empty()
-        ):
-            with contextlib.suppress(queue.Empty):
-                report(*steps.get(timeout=0.2))
-        if interrupted.is_set():
-            stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise KeyboardInterrupt
-        for future, block in futures.items():
-            error = future.exception()
-            if isinstance(error, BrokenProcessPool):
-                error = CollectError("its process was killed", do="is there enough memory?")
-            failures += future.result() if error is None else [(task, error) for task in block]
+    with _progress(tasks, console) as report:
+        blocks = blocks_of(tasks, engine.workers)
+        for block, outcome in engine.run(collect_block, blocks, report):
+            if isinstance(outcome, Exception):
+                failures += [(task, outcome) for task in block]
+            else:
+                failures += outcome
     return failures
-
-
-def _collect_in_process(block: list[Task], steps: Any, stop: Any) -> list[Failure]:
-    """Collect runs in a worker; it stops, with what it has committed, when it is told to."""
-
-    def report(seed: int, num_timesteps: int) -> None:
-        steps.put((seed, num_timesteps))
-        if stop.is_set():
-            raise KeyboardInterrupt
-
-    return [] if stop.is_set() else collect_block(block, report)
-
-
-@contextlib.contextmanager
-def _noted_interrupts() -> Iterator[threading.Event]:
-    """Note Ctrl-C instead of raising it anywhere, also when it is pressed again and again.
-
-    An exception in the middle of the pool's own work would tear it apart.
-    """
-    noted = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield noted  # only the main thread gets interrupts
-        return
-    before = signal.signal(signal.SIGINT, lambda *_: noted.set())
-    try:
-        yield noted
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

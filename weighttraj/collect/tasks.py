@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from weighttraj.collect.population import Origin, Population, origins_of
 from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.recipe import Recipe, Store
 from weighttraj.collect.recorder import Recorder
+from weighttraj.errors import CollectError
 from weighttraj.format.packing import pack
 from weighttraj.format.storage import read_info
 from weighttraj.threads import one_torch_thread
@@ -62,10 +64,12 @@ def collect_block(tasks: Sequence[Task], report: Report) -> list[Failure]:
     One thread: the thread count moves the bits.
 
     Raises:
+        CollectError: the data set is not here.
         KeyboardInterrupt: it was stopped; what was recorded is committed.
     """
     failures: list[Failure] = []
     unfinished = []
+    _check_folder(tasks[0].path.parents[1])
     for task in tasks:
         with _noted(task, failures):
             unfinished += [] if _is_complete(task.path) else [task]
@@ -231,6 +235,16 @@ class _ProgressCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         self._report(self._seed, self.num_timesteps)
+
+
+def _check_folder(path: Path) -> None:
+    if not (path / "dataset.json").is_file():
+        raise CollectError(
+            "this machine does not see the data set",
+            expected="dataset.json, as whoever gave the task has written it",
+            where=f"{path} on {platform.node()}",
+            do="collect into a folder that all machines share, at the same path",
+        )
 
 
 def _is_complete(path: Path) -> bool:

@@ -10,11 +10,8 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
-import multiprocessing
 import os
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -31,6 +28,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from weighttraj.engine import Engine, Tell, engine_of
 from weighttraj.errors import PolicyError, StoreLockedError
 from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, store_returns
 from weighttraj.format.catalog import MANIFEST, read_dataset_info
@@ -107,6 +105,7 @@ def fill_returns(
     config: ReturnsConfig | None = None,
     *,
     workers: int = 1,
+    scheduler: str | None = None,
     replace: bool = False,
     console: Console | None = None,
 ) -> Dataset:
@@ -119,6 +118,8 @@ def fill_returns(
         path: data set.
         config: which snapshots and episodes; None: the defaults.
         workers: processes; 1 means this one.
+        scheduler: address of a Dask scheduler whose workers do it instead, or ``local``; see
+            ``weighttraj.engine``.
         replace: drop returns of another evaluation (other episodes, versions of the physics).
         console: where progress is shown; None: nowhere.
 
@@ -127,22 +128,21 @@ def fill_returns(
 
     Raises:
         FileNotFoundError: there is no data set at the path.
+        EngineError: there are no workers, or no scheduler answers.
         PolicyError: a run has returns of another evaluation, or cannot be evaluated.
         StoreLockedError: somebody else is doing the same.
         KeyboardInterrupt: it was stopped; what was played stays.
     """
-    path, config = Path(path), config or ReturnsConfig()
+    path, config = Path(path).absolute(), config or ReturnsConfig()
     console = console or Console(quiet=True)
-    if workers < 1:
-        raise PolicyError("nobody to do the work", expected="workers at least 1", got=workers)
     read_dataset_info(path)  # before a lock is put beside it: is there one?
-    with _only_one(path.resolve()):
+    with engine_of(workers, scheduler) as engine, _only_one(path.resolve()):
         runs = _finished(open_dataset(path), console)
         works = [_Work(run, path / ".returns", config, replace=replace) for run in runs]
         works = [work for work in works if work.missing or work.unsaved]
         if works:
             unseal(path)
-        _play(works, workers, console)
+        _play(works, engine, console)
         # Also when a run got its returns before a kill, and the tables did not.
         if open_dataset(path).info.status == "complete" and not (path / MANIFEST).is_file():
             seal(path)
@@ -295,7 +295,7 @@ def _finished(dataset: Dataset, console: Console) -> list[Run]:
     return done
 
 
-def _play(works: Sequence[_Work], workers: int, console: Console) -> None:
+def _play(works: Sequence[_Work], engine: Engine, console: Console) -> None:
     """Play all tasks of all runs."""
     if slow := sorted({env_of(work.run).id for work in works if _is_slow(work)}):
         console.print(f"{', '.join(slow)}: no batched physics, so Gymnasium's own loop, slowly")
@@ -314,8 +314,13 @@ def _play(works: Sequence[_Work], workers: int, console: Console) -> None:
     )
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task("returns", total=sum(len(task.rows) for _, task in tasks))
-        for work, task, played in _outcomes(tasks, workers):
-            work.add(task.rows, played)
+        work_of = {(task.path, task.rows[0]): work for work, task in tasks}
+        # Nothing is lost with a worker that is stopped at once.
+        outcomes = engine.run(play_rows, [task for _, task in tasks], lambda: None, wait=False)
+        for task, played in outcomes:
+            if isinstance(played, Exception):
+                raise played
+            work_of[task.path, task.rows[0]].add(task.rows, played)
             progress.advance(bar, len(task.rows))
 
 
@@ -323,41 +328,15 @@ def _is_slow(work: _Work) -> bool:
     return work.evaluation.simulator == GymnasiumSimulator.name
 
 
-def _outcomes(
-    tasks: Sequence[tuple[_Work, _Task]], workers: int
-) -> Iterator[tuple[_Work, _Task, EpisodeReturns]]:
-    if workers == 1 or len(tasks) < 2:
-        for work, task in tasks:
-            yield work, task, play_rows(task)
-        return
-    before = multiprocessing.active_children()
-    pool = ProcessPoolExecutor(
-        min(workers, len(tasks)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-    )
-    try:
-        futures: dict[Future[EpisodeReturns], tuple[_Work, _Task]] = {
-            pool.submit(play_rows, task): (work, task) for work, task in tasks
-        }
-        for future in as_completed(futures):
-            yield *futures[future], future.result()
-        pool.shutdown()
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            if process not in before:  # they write nothing, so nothing is lost
-                process.terminate()
-        raise
-
-
-def play_rows(task: _Task) -> EpisodeReturns:
+def play_rows(task: _Task, tell: Tell) -> EpisodeReturns:
     """Returns and lengths (snapshot, episode) of some snapshots, both modes side by side."""
     run, config = open_run(task.path), task.config
     policies = load_policies(run, task.rows)
     with Evaluator(env_of(run), episodes=config.episodes, seed=config.seed) as evaluator:
-        played = [evaluator(policies, deterministic=m == "deterministic") for m in config.modes]
+        played = []
+        for mode in config.modes:
+            tell()  # it may be time to stop
+            played.append(evaluator(policies, deterministic=mode == "deterministic"))
     returns, lengths = (np.concatenate(parts, axis=1) for parts in zip(*played, strict=True))
     return EpisodeReturns(returns, lengths)
 
