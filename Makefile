@@ -35,6 +35,8 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_callback.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_returns.py data/bench/inverted-pendulum data/bench/half-cheetah --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_learning.py --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_recipes.py --save
 	$(BIN)/python tests/benchmarks/results.py
 
 stress: setup ## kill, flip, delete, fuzz: about an hour

@@ -65,7 +65,42 @@ def render(results: dict[str, Any]) -> str:
         "environment steps of SB3 in the same CPU time, both recording."
         for case, row in results.get("population", {}).get("cases", {}).items()
     ]
+    if "learning" in results:
+        lines += _learning(results["learning"])
+    if "recipes" in results:
+        lines += _tried(results["recipes"])
     return "\n".join(lines)
+
+
+def _tried(recipes: dict[str, Any]) -> list[str]:
+    """The table of recipes that were tried short."""
+    cases, episodes = recipes["cases"], recipes["episodes"]
+    lines = [
+        "",
+        "| [recipe](datasets/README.md), tried short | parameters | seeds | steps a CPU second "
+        f"| MB a run | return: first {episodes} episodes | last {episodes} "
+        "| whole: CPU hours | GB |",
+        "|---|" + "---:|" * 8,
+    ]
+    lines += [
+        f"| {name} | {row['parameters']:,} | {row['seeds']} | {row['steps_per_cpu_s']:,} "
+        f"| {row['mb_per_run']:.2f} | {row['first_returns']:,.1f} | {row['last_returns']:,.1f} "
+        f"| {row['whole_cpu_hours']:.2f} | {row['whole_gb']:.2f} |"
+        for name, row in cases.items()
+    ]
+    found = [
+        f"{name}, {runs} runs: {finding}"
+        for name, row in cases.items()
+        for finding, runs in row["findings"].items()
+    ]
+    return [
+        *lines,
+        "",
+        f"Each for {recipes['iterations']} iterations of every seed, by one population in one "
+        "thread; returns of training episodes, means over seeds. Whole: what the recipe will take "
+        "at that rate. `verify` finds every run whole; "
+        f"`lint` finds {'; '.join(found) or 'nothing suspicious'}.",
+    ]
 
 
 def _returns(row: dict[str, Any]) -> str:
@@ -76,6 +111,57 @@ def _returns(row: dict[str, Any]) -> str:
         f"{row['over_limit']:.2f} of the speed of the bare physics; two threads "
         f"{row['two_threads']:.1f} times as fast as one."
     )
+
+
+def _learning(learning: dict[str, Any]) -> list[str]:
+    """Two samples of runs side by side, what tests say of them, and the runs of the same seeds."""
+    seeds = {who: "{} to {}".format(*ends) for who, ends in learning["seeds"].items()}
+    units = "x".join(map(str, learning["units"]))
+    lines = [
+        "",
+        f"| {learning['env']} {units}, {learning['timesteps']:,} steps | "
+        + " | ".join(f"{who}, seeds {numbers}" for who, numbers in seeds.items())
+        + " | difference | p: means, distributions | control: difference | p | same seeds: "
+        "difference | p |",
+        "|---|" + "---:|" * (len(seeds) + 6),
+    ]
+    for name, row in learning["samples"].items():
+        control, pairs = learning["control"][name], learning["same_seeds"][name]
+        ranges = zip(row["iqm"], row["intervals"], strict=True)
+        cells = [f"{iqm:,.0f} ({low:,.0f} to {high:,.0f})" for iqm, (low, high) in ranges]
+        cells += [
+            f"{row['difference_percent']:+.1f} % ± {row['half_width_percent']:.1f} %",
+            f"{row['p']['means']:.2g}, {row['p']['distributions']:.2g}",
+            f"{control['difference_percent']:+.1f} %",
+            f"{control['p']['means']:.2g}, {control['p']['distributions']:.2g}",
+            f"{pairs['difference_percent']:+.1f} %",
+            f"{pairs['p']:.2g}",
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    never = " and ".join(
+        f"{threshold} in {sb3} and {population} runs"
+        for threshold, sb3, population in zip(
+            learning["thresholds"], *(learning["never"][who] for who in seeds), strict=True
+        )
+    )
+    overlaps = sum(row["intervals_overlap"] for row in learning["samples"].values())
+    apart = "; ".join(
+        f"{name}: {pair['median_absolute']:,.3g} and {pair['max_absolute']:,.3g}"
+        for name, pair in learning["same_seeds"].items()
+    )
+    return [
+        *lines,
+        "",
+        f"Does a population learn as SB3 does? Training returns, means of {learning['episodes']} "
+        "episodes at the end of each rollout; a run that never reaches a threshold counts as the "
+        f"whole length ({never}). Interquartile means over runs with 95 % bootstrap intervals, of "
+        f"which {overlaps} of {len(learning['samples'])} overlap. Differences are of means; after "
+        "± stands the half width of the 95 % interval: a smaller difference does not show. p by "
+        "permutation, of the means and of Kolmogorov-Smirnov's statistic. Control: the population "
+        "on SB3's seeds against the population on its own, set apart by the seeds alone. "
+        "Same seeds: the population against SB3 run by run, p by flipping signs; the two are apart "
+        f"by (median and most) {apart}.",
+    ]
 
 
 def _load(load: dict[str, Any]) -> str:

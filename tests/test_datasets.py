@@ -1,0 +1,102 @@
+"""Our recipes can be collected; the page about them says what they say and runs as it stands."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import weighttraj as wt
+from tests.small import SMALL_RECIPE
+from weighttraj.collect import read_recipe
+from weighttraj.collect.population import check_config
+
+ROOT = Path(__file__).parents[1]
+RECIPES = sorted(ROOT.glob("datasets/*/recipe.toml"))
+PAGE = (ROOT / "datasets/README.md").read_text()
+BLOCKS = re.findall(r"```(python|bash)\n(.*?)```", PAGE, re.DOTALL)
+
+# The page runs as it stands, on shorter trainings: a second each.
+SHORT = "256\nn_steps = 64\nbatch_size = 16\nn_epochs = 8"
+SHORTER = {" = 40_960": f" = {SHORT}", "=40_960": "=256"}
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "tests/benchmarks"))
+    return importlib.import_module("bench_recipes")
+
+
+@pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.parent.name)
+def test_a_recipe_can_be_collected(path: Path) -> None:
+    recipe = read_recipe(path)
+    assert recipe.id == path.parent.name
+    if recipe.collect.collector == "population":
+        check_config(recipe.ppo)
+
+
+def test_the_table_is_fresh(bench: ModuleType) -> None:
+    assert bench.insert(PAGE) == PAGE, "run: python tests/benchmarks/bench_recipes.py --table"
+    stale = PAGE.replace("| 71,948 |", "| 71,949 |")
+    assert bench.insert(stale) == PAGE != stale
+
+
+def test_sizes_of_a_recipe_are_those_of_its_runs(bench: ModuleType, small_dataset: Path) -> None:
+    run = wt.open(small_dataset).runs[0]
+    assert bench.snapshots_of(SMALL_RECIPE) == len(run)
+    assert bench.parameters_of(SMALL_RECIPE) == run.layout.size
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "snapshots"),
+    [("inverted-pendulum-v4-ppo-v1", 122, 1951), ("half-cheetah-v4-ppo-v1", 71_948, 4881)],
+)
+def test_sizes_of_the_papers_recipes(
+    bench: ModuleType, name: str, parameters: int, snapshots: int
+) -> None:
+    recipe = read_recipe(ROOT / "datasets" / name / "recipe.toml")
+    assert (bench.parameters_of(recipe), bench.snapshots_of(recipe)) == (parameters, snapshots)
+
+
+def test_every_block_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for path in RECIPES:
+        copy = tmp_path / path.relative_to(ROOT)
+        copy.parent.mkdir(parents=True)
+        copy.write_text(path.read_text().replace("1_000_000", SHORT).replace('"0:6"', '"0:2"'))
+    used = set()
+    names: dict[str, object] = {}
+    script = f'set -eu\nweighttraj() {{ "{sys.executable}" -m weighttraj.cli "$@"; }}\n'
+    for kind, text in BLOCKS:
+        block = text
+        for long, short in SHORTER.items():
+            used |= {long} if long in block else set()
+            block = block.replace(long, short)
+        if kind == "python":
+            exec(compile(block, "datasets/README.md", "exec"), names)  # noqa: S102
+        else:
+            script += block
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-c", script],  # noqa: S607
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+    )
+    assert done.returncode == 0, f"{done.stdout}{done.stderr}"
+    assert used == set(SHORTER)
+    for name, runs in (("swimmer-short", 6), ("reacher-v4-ppo-v1", 6), ("walker", 4)):
+        assert len(wt.open(tmp_path / "data" / name).info.runs) == runs
+
+
+def test_links_of_the_page_lead_somewhere() -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", PAGE):
+        path = target.split("#")[0]
+        assert target.startswith("https://") or (ROOT / "datasets" / path).exists(), target
