@@ -12,12 +12,14 @@ setup: .venv/installed
 	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
 	touch $@
 
-demo: setup ## collect four runs, train TIPL on three, judge it on the fourth: about five minutes
-	$(BIN)/weighttraj collect datasets/demo/recipe.toml --out $(DEMO)/dataset --workers 2
-	$(BIN)/weighttraj returns $(DEMO)/dataset --every 25 --episodes 5
-	$(BIN)/weighttraj report $(DEMO)/dataset --out $(DEMO)/dataset.html
-	$(BIN)/tipl train --data $(DEMO)/dataset --out $(DEMO)/tipl --n-batches 500 --warmup 100 --save-every 100
-	$(BIN)/tipl evaluate $(DEMO)/tipl --data $(DEMO)/dataset --out $(DEMO)/report --return-starts 5 --episodes 5
+demo: setup ## open the released data, collect a run beside it, train TIPL, judge it: about six minutes
+	$(BIN)/weighttraj verify inverted-pendulum-v4-ppo-v1
+	$(BIN)/weighttraj show inverted-pendulum-v4-ppo-v1
+	$(BIN)/weighttraj collect datasets/demo/recipe.toml --out $(DEMO)/live
+	$(BIN)/weighttraj returns $(DEMO)/live --every 25 --episodes 5
+	$(BIN)/weighttraj report $(DEMO)/live --out $(DEMO)/live.html
+	$(BIN)/tipl train --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/tipl --n-batches 500 --warmup 100 --save-every 100
+	$(BIN)/tipl evaluate $(DEMO)/tipl --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/report --quick --workers 2
 
 test: setup ## run the tests
 	$(BIN)/python -m pytest -q -n 2
@@ -35,6 +37,7 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_callback.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_returns.py data/bench/inverted-pendulum data/bench/half-cheetah --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --processes --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_learning.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_recipes.py --save
 	$(BIN)/python tests/benchmarks/results.py

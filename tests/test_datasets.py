@@ -10,12 +10,14 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
 import weighttraj as wt
 from tests.small import SMALL_RECIPE
 from weighttraj.collect import read_recipe
 from weighttraj.collect.population import check_config
+from weighttraj.collect.recipe import SPLITS
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(ROOT.glob("datasets/*/recipe.toml"))
@@ -94,6 +96,44 @@ def test_every_block_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monkey
     assert used == set(SHORTER)
     for name, runs in (("swimmer-short", 6), ("reacher-v4-ppo-v1", 6), ("walker", 4)):
         assert len(wt.open(tmp_path / "data" / name).info.runs) == runs
+
+
+# What lies in this repository
+
+RELEASED = sorted(path.parent for path in ROOT.glob("datasets/*/data/dataset.json"))
+
+
+@pytest.mark.parametrize("path", RELEASED, ids=lambda path: path.parent.name)
+def test_a_released_data_set_is_whole(path: Path) -> None:
+    dataset = wt.open(path.parent.name)
+    recipe = read_recipe(path.parent / "recipe.toml")
+    assert dataset.info.status == "complete"
+    assert {run.info.seed: run.split for run in dataset} == recipe.splits()
+    assert wt.verify(path, deep=True) == []
+    assert wt.lint(path) == []
+    assert sum(file.stat().st_size for file in path.rglob("*")) < 60e6
+
+
+def test_the_released_pendulums_are_at_the_papers_scale() -> None:
+    dataset = wt.open("inverted-pendulum-v4-ppo-v1")
+    assert [len(dataset.split(name).runs) for name in SPLITS] == [30, 10, 10]
+    evaluated = {*range(100), *range(0, 1951, 10), 1950}
+    for run in dataset:
+        assert run.weights.shape == (1951, 122)
+        assert run["probe/observations"].shape[1:] == (32, 4)
+        assert run.returns.shape == (1951, 20)
+        for deterministic in (True, False):
+            means = run.mean_return(deterministic=deterministic)
+            assert set(np.flatnonzero(np.isfinite(means)).tolist()) == evaluated
+
+
+@pytest.mark.parametrize("path", RELEASED, ids=lambda path: path.parent.name)
+def test_the_facts_are_fresh(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tests/benchmarks"))
+    facts = importlib.import_module("facts")
+    page = (path.parent / "README.md").read_text()
+    told = f"run: python tests/benchmarks/facts.py {path.parent.name}"
+    assert facts.insert(page, wt.open(path)) == page, told
 
 
 def test_links_of_the_page_lead_somewhere() -> None:

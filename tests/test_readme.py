@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+import weighttraj as wt
 from tipl.report import insert_markdown
 
 ROOT = Path(__file__).parents[1]
@@ -23,25 +24,27 @@ BLOCKS = re.findall(r"```(python|bash)\n(.*?)```", README, re.DOTALL)
 
 # The commands run as they stand, on a shorter recipe and with less of what only takes time.
 SHORTER = {"--n-batches 500": "--n-batches 4", "--episodes 5": "--episodes 1"}
+SHORT_RECIPE = {
+    "51_200": "768\nn_steps = 64\nbatch_size = 16\nn_epochs = 2\ncritic_arch = [8, 8]",
+    "every = 64": "every = 2\nblock = 8\nprobe_observations = 4",
+}
 NOT_RUN = ("make ", ". .venv")  # they would run this test; the environment is active
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, small_dataset: Path) -> Path:
-    """Where a reader stands after `make demo`, with shorter runs."""
-    folder = tmp_path_factory.mktemp("readme")
-    shutil.copytree(small_dataset, folder / "data/demo/dataset")
+@pytest.fixture
+def folder(tmp_path: Path, small_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where a reader stands; the released data set and the recipe are short ones."""
+    released = tmp_path / "datasets/inverted-pendulum-v4-ppo-v1"
+    shutil.copytree(small_dataset, released)
+    wt.policies.fill_returns(released, wt.policies.ReturnsConfig(episodes=1, every=24))
+    monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(released.parent))
     recipe = (ROOT / "datasets/demo/recipe.toml").read_text()
-    recipe = recipe.replace('id = "demo"', 'id = "small"').replace('"0:3"', '"0:2"')
-    recipe = recipe.replace('"3:4"', '"2:4"').replace(
-        "every = 64", "every = 2\nblock = 8\nprobe_observations = 4"
-    )
-    recipe = recipe.replace(
-        "51_200", "768\nn_steps = 64\nbatch_size = 16\nn_epochs = 2\ncritic_arch = [8, 8]"
-    )
-    (folder / "datasets/demo").mkdir(parents=True)
-    (folder / "datasets/demo/recipe.toml").write_text(recipe)
-    return folder
+    for long, short in SHORT_RECIPE.items():
+        assert long in recipe
+        recipe = recipe.replace(long, short)
+    (tmp_path / "datasets/demo").mkdir()
+    (tmp_path / "datasets/demo/recipe.toml").write_text(recipe)
+    return tmp_path
 
 
 def test_every_block_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,9 +80,9 @@ def test_the_makefile_runs_the_readmes_commands() -> None:
     makefile = (ROOT / "Makefile").read_text()
     makefile = makefile.replace("$(BIN)/", "").replace("$(DEMO)", "data/demo")
     commands = [line for kind, text in BLOCKS if kind == "bash" for line in text.splitlines()]
-    for name in ("weighttraj collect", "tipl train", "tipl evaluate"):
+    for name in ("weighttraj collect", "weighttraj returns", "tipl train", "tipl evaluate"):
         command = next(line for line in commands if line.startswith(name))
-        assert command in makefile
+        assert command.split("  ")[0] in makefile
 
 
 def test_the_numbers_come_from_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

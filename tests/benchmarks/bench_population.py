@@ -10,6 +10,11 @@ python -W ignore tests/benchmarks/bench_population.py --fidelity
 How far is a population's run from SB3's of the same seed, at full settings? Beside it, how far is
 SB3's own run after one weight was moved by one unit in the last place: chaotic physics magnifies
 any difference, and HalfCheetah is chaotic within a rollout.
+
+python -W ignore tests/benchmarks/bench_population.py --processes
+
+How much sooner is a data set there when two processes collect it instead of one? Wall time of
+`collect` from the recipe to the sealed data set, start-up included, in turns.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +37,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 import weighttraj as wt
-from weighttraj.collect import PPOConfig, WeightTrajectoryCallback, make_ppo
+from weighttraj.collect import PPOConfig, Recipe, WeightTrajectoryCallback, collect, make_ppo
 from weighttraj.collect.learners import Learners
 from weighttraj.collect.population import Population, origins_of
-from weighttraj.collect.recipe import Store
+from weighttraj.collect.recipe import Collect, Seeds, Store
 from weighttraj.collect.recorder import Recorder
 from weighttraj.collect.rollouts import Environments
 from weighttraj.collect.tasks import open_recorder
@@ -186,6 +192,33 @@ def fidelity(iterations: int) -> dict[str, Any]:
     return cases
 
 
+def processes(iterations: int, turns: int) -> dict[str, Any]:
+    """Wall seconds of one process and of two."""
+    ppo = replace(PENDULUM, total_timesteps=iterations * PENDULUM.n_steps)
+    recipe = Recipe(
+        id="processes",
+        ppo=ppo,
+        seeds=Seeds(train="0:32"),
+        collect=Collect(collector="population", population=16),
+    )
+    wall: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(turns):
+        for workers, seconds in wall.items():
+            with tempfile.TemporaryDirectory() as folder:
+                start = time.monotonic()
+                collect(recipe, Path(folder) / "dataset", workers=workers)
+                seconds.append(round(time.monotonic() - start, 1))
+                print(f"{workers} processes: {seconds[-1]} s", flush=True)
+    ratios = [one / two for one, two in zip(wall[1], wall[2], strict=True)]
+    return {
+        "case": "InvertedPendulum-v4, 8x8",
+        "runs": 32,
+        "iterations": iterations,
+        "wall_s": {str(workers): seconds for workers, seconds in wall.items()},
+        "times_faster": round(statistics.median(ratios), 2),
+    }
+
+
 def nudge(model: PPO) -> None:
     with torch.no_grad():
         weight = model.policy.action_net.weight
@@ -202,10 +235,13 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=2)
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--fidelity", action="store_true", help="measure that instead of speed")
+    parser.add_argument("--processes", action="store_true", help="measure these instead")
     parser.add_argument("--save", action="store_true", help="keep the figures in results.json")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    if args.fidelity:
+    if args.processes:
+        name, result = "processes", processes(max(30, args.iterations), args.turns)
+    elif args.fidelity:
         name, result = "population_fidelity", {"cases": fidelity(max(3, args.iterations))}
     else:
         name, result = "population", {"cases": speed(args.iterations, args.turns)}

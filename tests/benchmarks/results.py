@@ -65,6 +65,12 @@ def render(results: dict[str, Any]) -> str:
         "environment steps of SB3 in the same CPU time, both recording."
         for case, row in results.get("population", {}).get("cases", {}).items()
     ]
+    if "processes" in results:
+        row = results["processes"]
+        lines.append(
+            f"{row['runs']} runs of {row['iterations']} iterations, {row['case']}: two processes "
+            f"are done {row['times_faster']} times as fast as one, start-up included."
+        )
     if "learning" in results:
         lines += _learning(results["learning"])
     if "recipes" in results:
