@@ -191,15 +191,19 @@ ALLOWED = {
         "tipl.tokens",
         "door weighttraj",
     ],
-    "tipl.report": ["tipl.errors"],
-    "tipl.evaluate": [
+    "tipl.report": ["tipl.errors", "tipl.report"],
+    "tipl.evaluation": [
         "tipl.baselines",
         "tipl.errors",
+        "tipl.evaluation",
         "tipl.forecast",
         "tipl.report",
         "door weighttraj",
+        "weighttraj.engine",
         "weighttraj.policies",
+        "weighttraj.threads",
     ],
+    "tipl.zoo": ["tipl.baselines", "tipl.errors", "tipl.forecast"],
     "tipl.cli": ["tipl", "weighttraj.errors"],
     "tipl": ["tipl", "weighttraj.errors"],
 }

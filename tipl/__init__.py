@@ -15,10 +15,11 @@ except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "tipl") from error
 
 from tipl.baselines import Persistence, Reconstruction
-from tipl.evaluate import EvaluateConfig, evaluate
+from tipl.evaluation import EvaluateConfig, evaluate
 from tipl.forecast import TIPL, Forecaster
 from tipl.representation import TemporalSVD
 from tipl.train import TrainConfig, train
+from tipl.zoo import load
 
 __all__ = [
     "TIPL",
@@ -29,6 +30,7 @@ __all__ = [
     "TemporalSVD",
     "TrainConfig",
     "evaluate",
+    "load",
     "train",
 ]
 

@@ -51,6 +51,7 @@ class Reconstruction:
     rank: int
     """Rank of the basis."""
     causal = False
+    floor = True
 
     @property
     def name(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +18,8 @@ from weighttraj.errors import WeightTrajError
 try:
     import tipl
     from tipl import report
-    from tipl.evaluate import EvaluateConfig
+    from tipl.evaluation import EvaluateConfig
+    from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
 except WeightTrajError as error:
     sys.exit(f"error: {error}")
@@ -37,16 +38,21 @@ def _train(config: TrainConfig) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Evaluate(EvaluateConfig):
-    models: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of trained models."""
+    forecasters: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Folders of models, or names of forecasters that need no fit (``tipl zoo`` lists them)."""
+    workers: int = 1
+    """Processes, each with one thread; each takes a run at a time."""
 
 
 @app.command(name="evaluate")
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
-def _evaluate(config: _Evaluate) -> None:
-    """Judge models on unseen runs beside a copy of the last weights; writes a report."""
-    models = [tipl.TIPL.load(path) for path in config.models]
-    results = tipl.evaluate(models, config, console=console)
+def _evaluate(args: _Evaluate) -> None:
+    """Judge forecasters on unseen runs beside a copy of the last weights; writes a report."""
+    forecasters = [tipl.load(name) for name in args.forecasters]
+    config = EvaluateConfig(
+        **{field.name: getattr(args, field.name) for field in fields(EvaluateConfig)}
+    )
+    results = tipl.evaluate(forecasters, config, workers=args.workers, console=console)
     console.print(_table(results))
     print(report.verdict(results))
     print(f"report: {config.out / 'report.html'}")
@@ -69,16 +75,13 @@ def _report(
 
 
 def _table(results: dict[str, Any]) -> Table:
-    modes = results["modes"]
+    (overview,) = headline(results)
     table = Table(title=f"{results['data']}, {results['split']} runs: {', '.join(results['runs'])}")
-    for column in ("forecaster", "h", "WPE", "skill", *(f"REPW {mode}" for mode in modes)):
-        table.add_column(column, justify="left" if column == "forecaster" else "right")
-    for row in report.table(results):
-        if row["h"] in report.SHOWN_HORIZONS:
-            interval = "" if row["low"] is None else f" [{row['low']:.3g}, {row['high']:.3g}]"
-            cells = [f"{row['wpe']:.3g}", f"{row['value']:.3g}{interval}"]
-            cells += [f"{row['repw'][mode]:.1f}" for mode in modes]
-            table.add_row(report.label(row["name"]), str(row["h"]), *cells)
+    table.add_column("forecaster")
+    for column in overview.columns:
+        table.add_column(column, justify="right")
+    for name, cells in overview.rows:
+        table.add_row(report.label(name), *(escape(cell(row)) for row in cells))
     return table
 
 

@@ -1,155 +1,365 @@
 from __future__ import annotations
 
 import json
-from importlib import import_module
+import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import weighttraj as wt
-from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evaluate, train
-from tipl.errors import EvaluateError
-from tipl.evaluate import _Errors, skill_with_interval, squared_errors
+from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evaluate, load, train
+from tipl.errors import EvaluateError, ModelError
+from tipl.evaluation import measure
+from tipl.evaluation.parts import Parts
+from tipl.evaluation.starts import at_boundary, learning_phase, starts_of
+from tipl.evaluation.statistics import Bootstrap, interquartile_mean, mean, ratio_of_sums
+from tipl.evaluation.weights import squared_errors
 from tipl.report import verdict
+from weighttraj.policies import ReturnsConfig, fill_returns
 from weighttraj.policies import evaluate as play
 
-HORIZONS = np.arange(1, 4)
+SMALL = {
+    "horizons": (1, 2, 3),
+    "return_horizons": (1, 3),
+    "learning_starts": 2,
+    "plateau_starts": 1,
+    "episodes": 3,
+    "bootstrap": 200,
+}
 
 
 @pytest.fixture(scope="module")
-def results(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model trained for a moment, and its evaluation."""
-    out = tmp_path_factory.mktemp("results")
-    model = train(
-        TrainConfig(
-            data=small_dataset,
-            out=out / "tipl",
-            rank=8,
-            n_batches=20,
-            warmup=5,
-            block_size=5,
-            n_layer=1,
-            n_embd=16,
-        )
+def data(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs with returns."""
+    path = tmp_path_factory.mktemp("evaluate") / "data"
+    shutil.copytree(small_dataset, path)
+    fill_returns(path, ReturnsConfig(episodes=2, every=6))
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(data: Path) -> Path:
+    """A model trained for a moment."""
+    out = data.with_name("tipl")
+    config = TrainConfig(
+        data=data, out=out, rank=8, n_batches=20, warmup=5, block_size=5, n_layer=1, n_embd=16
     )
-    config = EvaluateConfig(
-        data=small_dataset, out=out, max_horizon=3, return_starts=2, episodes=3, bootstrap=200
-    )
-    evaluate([model], config)
+    train(config)
     return out
 
 
-def load(results: Path) -> dict:
-    return json.loads((results / "results.json").read_text())
+@pytest.fixture(scope="module")
+def config(data: Path) -> EvaluateConfig:
+    return EvaluateConfig(data=data, out=data.with_name("results"), **SMALL)
 
 
-def test_persistence_is_the_zero_of_skill(results: Path, small_dataset: Path) -> None:
-    scores = load(results)["forecasters"]["persistence"]
-    assert all(row["value"] == 0 for row in scores["skill"])
+@pytest.fixture(scope="module")
+def results(model: Path, config: EvaluateConfig) -> dict[str, Any]:
+    """Its evaluation."""
+    evaluate([load(model)], config)
+    document: dict[str, Any] = json.loads((config.out / "results.json").read_text())
+    return document
+
+
+def unseen(data: Path) -> wt.Run:
+    return wt.open(data).split("test").runs[0]
+
+
+# Weights
+
+
+def test_skill_is_computed_as_it_says(results: dict[str, Any], data: Path) -> None:
+    skills = results["forecasters"]["reconstruction-8"]["skill"]
+    sums, ratios, of_tensors = np.zeros((2, 2)), [], []
+    for run in wt.open(data).split("test"):
+        weights = run.weights[:].astype(np.float64)
+        starts = np.arange(49 - 3)
+        floor = Reconstruction(8).forecast(run, starts.tolist(), [2])[:, 0]
+        error = (floor - weights[starts + 2]) ** 2
+        copy = (weights[starts] - weights[starts + 2]) ** 2
+        crosses = run.iteration[starts + 1] != run.iteration[starts]
+        for row, chosen in enumerate((np.ones(46, bool), crosses)):
+            sums[row] += error[chosen].sum(), copy[chosen].sum()
+        ratios.append((1 - error.sum(1) / copy.sum(1)).mean())
+        of_tensors.append(
+            [(error[:, p.slice].sum(), copy[:, p.slice].sum()) for p in run.layout.params]
+        )
+    by_tensor = np.sum(of_tensors, axis=0)
+    expected = {
+        ("ratio_of_sums", "all"): 1 - sums[0, 0] / sums[0, 1],
+        ("ratio_of_sums", "boundary"): 1 - sums[1, 0] / sums[1, 1],
+        ("mean_of_ratios", "all"): np.mean(ratios),
+        ("tensors_equal", "all"): (1 - by_tensor[:, 0] / by_tensor[:, 1]).mean(),
+    }
+    for (aggregate, kind), value in expected.items():
+        row = skills[aggregate][kind][1]
+        assert row["h"] == 2
+        assert row["value"] == pytest.approx(value, rel=1e-3), (aggregate, kind)
+        assert row["low"] <= row["value"] <= row["high"]
+
+
+def test_persistence_is_the_zero_of_every_skill(results: dict[str, Any], data: Path) -> None:
+    scores = results["forecasters"]["persistence"]
+    for rows in (*_lists(scores["skill"]), *_lists(scores["function_skill"])):
+        assert [row["value"] for row in rows] == [0, 0, 0]
     errors = []
-    for run in wt.open(small_dataset).split("test"):
+    for run in wt.open(data).split("test"):
         weights = run.weights[:].astype(np.float64)
         starts = np.arange(49 - 3)
         errors.append(((weights[starts + 2] - weights[starts]) ** 2).mean())
     assert scores["wpe"][1]["value"] == pytest.approx(np.mean(errors), rel=1e-6)
 
 
-def test_errors_are_summed_over_every_start(
-    small_dataset: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = wt.open(small_dataset).split("test").runs[0]
-    weights = run.weights[:]
-    whole = squared_errors(Reconstruction(4), run, weights, HORIZONS)
-    monkeypatch.setattr(
-        import_module("tipl.evaluate"), "MAX_BYTES", 122 * 3 * 4 * 7
-    )  # chunks of 7 starts
-    parts = squared_errors(Reconstruction(4), run, weights, HORIZONS)
-    np.testing.assert_allclose(parts.forecast, whole.forecast)
-    assert whole.count == parts.count == 46 * 122
+def _lists(found: Any) -> list[list[dict[str, Any]]]:
+    return [found] if isinstance(found, list) else [x for y in found.values() for x in _lists(y)]
 
 
-def test_skill_and_interval_by_hand() -> None:
-    def errors(forecast: float, copy: float) -> _Errors:
-        return _Errors(np.array([float(forecast)]), np.array([float(copy)]), 1)
-
-    one = skill_with_interval([errors(1, 4)], resamples=10, seed=0)
-    assert one == [{"value": 0.75, "low": None, "high": None}]
-    two = skill_with_interval([errors(1, 4), errors(6, 4)], resamples=1000, seed=0)
-    assert two == [{"value": 1 - 7 / 8, "low": -0.5, "high": 0.75}]
-
-
-def test_the_floor_is_below_the_model(results: Path) -> None:
-    by_name = load(results)["forecasters"]
-    assert by_name["reconstruction-8"]["skill"][0]["value"] > 0.5
-    assert by_name["tipl"]["skill"][0]["value"] < by_name["reconstruction-8"]["skill"][0]["value"]
-    assert by_name["tipl"]["causal"] is False
-    interval = by_name["tipl"]["skill"][0]
-    assert interval["low"] <= interval["value"] <= interval["high"]
+def test_chunks_do_not_move_the_errors(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = (Reconstruction(4), unseen(data), np.arange(40), [1, 3])
+    whole = squared_errors(*arguments, lambda _: None)["squared"]
+    monkeypatch.setattr("tipl.evaluation.weights.MAX_BYTES", 122 * 2 * 4 * 7)
+    done: list[int] = []
+    parts = squared_errors(*arguments, done.append)["squared"]
+    assert done == [7] * 5 + [5]
+    np.testing.assert_array_equal(parts, whole)
+    assert whole.shape == (40, 2, 7)
 
 
-def test_returns_are_of_the_right_policies(results: Path, small_dataset: Path) -> None:
-    document, run = load(results), wt.open(small_dataset).split("test").runs[0]
-    starts = [0, 49 - 1 - 3]
+def test_divergence_is_that_of_the_distributions(data: Path, tmp_path: Path) -> None:
+    """Against each policy's own distribution, one by one."""
+    run = unseen(data)
+    task = measure.Task(
+        path=run.path,
+        forecasters=(Persistence(),),
+        config=EvaluateConfig(data=data, out=data, **SMALL),
+    )
+    found = measure.measure(task, lambda *_: None)
+    for start in (0, 17):
+        for i, h in enumerate((1, 2, 3)):
+            inputs = torch.from_numpy(
+                run["probe/observations"][max(0, run.iteration[start + h] - 1)]
+            )
+            true, copy = (run.load_policy(t).distribution(inputs) for t in (start + h, start))
+            expected = torch.distributions.kl_divergence(true, copy).sum(-1).mean()
+            kl = found.functions["persistence"]["kl"][start, i]
+            assert kl == pytest.approx(float(expected), rel=1e-3, abs=1e-9)
+
+
+# Starts
+
+
+def test_boundaries_are_where_new_data_arrive(data: Path) -> None:
+    run = unseen(data)
+    crossing = np.flatnonzero(at_boundary(run, np.arange(48)))
+    assert crossing.tolist() == list(range(0, 48, 4))  # 4 snapshots an iteration
+
+
+def test_the_learning_phase_ends_when_most_is_learned(data: Path) -> None:
+    run = unseen(data)
+    mean_return = run.mean_return(deterministic=False)
+    rows = np.flatnonzero(np.isfinite(mean_return))
+    end = learning_phase(run)
+    assert end in rows
+    final = np.median(mean_return[rows[-2:]])
+    before = mean_return[rows[rows < end]] - mean_return[0]
+    assert (before < 0.95 * (final - mean_return[0])).all()
+
+
+def test_starts_leave_room_for_every_horizon(data: Path) -> None:
+    config = EvaluateConfig(data=data, out=data, horizons=(1, 20), return_horizons=(1, 5))
+    starts = starts_of(unseen(data), config)
+    assert starts.weights.tolist() == list(range(49 - 20))
+    assert starts.learning.max() < starts.plateau.min()
+    assert starts.plateau.max() == 48 - 5
+    few = starts_of(unseen(data), replace(config, starts=3, learning_starts=0))
+    assert few.weights.tolist() == [0, 14, 28]
+    assert not len(few.learning)
+
+
+# Statistics
+
+
+def test_intervals_resample_runs() -> None:
+    bootstrap = Bootstrap(resamples=1000, seed=0)
+    one = bootstrap.interval(ratio_of_sums, np.array([[1.0]]), np.array([[4.0]]))
+    assert one == [{"value": 0.25, "low": None, "high": None}]
+    two = bootstrap.interval(ratio_of_sums, np.array([[1.0], [6.0]]), np.array([[4.0], [4.0]]))
+    assert two == [{"value": 7 / 8, "low": 0.25, "high": 1.5}]
+    (row,) = bootstrap.interval(mean, np.array([[1.0], [np.nan], [3.0]]))
+    assert row["value"] == 2
+
+
+def test_a_known_interval_is_covered_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    hits = 0
+    for i in range(200):
+        sample = rng.normal(1.0, 1.0, size=(30, 1))
+        (row,) = Bootstrap(resamples=200, seed=i).interval(mean, sample)
+        hits += row["low"] <= 1.0 <= row["high"]  # type: ignore[operator]
+    assert 0.88 <= hits / 200 <= 0.98
+
+
+def test_the_interquartile_mean_is_the_middle_half() -> None:
+    values = np.arange(8.0)
+    assert interquartile_mean(values) == np.mean([2, 3, 4, 5])
+    # 5 values: the middle 2.5, those at the edges by a part
+    assert interquartile_mean(np.arange(5.0)) == pytest.approx((0.75 * 1 + 2 + 0.75 * 3) / 2.5)
+
+
+# Returns
+
+
+def test_returns_are_of_the_right_policies(results: dict[str, Any], config: EvaluateConfig) -> None:
+    run = unseen(config.data)
+    starts = starts_of(run, config)
+    at = [*starts.learning.tolist(), *starts.plateau.tolist()]
+    copy = results["forecasters"]["persistence"]
     for mode in ("deterministic", "sampled"):
-        found = document["forecasters"]["persistence"]["returns"][mode][0]
-        expected = [
-            play(run.load_policy(t + h), run, episodes=3, deterministic=mode == "deterministic")
-            for t in starts
-            for h in HORIZONS.tolist()
-        ]
-        assert found["true"] == [e.returns.mean() for e in expected]
-        copies = [
-            play(run.load_policy(t), run, episodes=3, deterministic=mode == "deterministic")
-            for t in starts
-        ]
-        assert found["forecast"] == [copies[i].returns.mean() for i in (0, 0, 0, 1, 1, 1)]
-        repw = document["forecasters"]["persistence"]["repw"][mode]
-        gaps = np.abs(np.subtract(found["true"], found["forecast"]))
-        other = document["forecasters"]["persistence"]["returns"][mode][1]
-        gaps = np.stack([gaps, np.abs(np.subtract(other["true"], other["forecast"]))])
-        by_horizon = gaps.reshape(2, 2, 3).mean((0, 1))
-        np.testing.assert_allclose([row["value"] for row in repw], by_horizon)
+        found = copy["scatter"][mode][0]
+        expected = {
+            t: play(run.load_policy(t), run, episodes=3, deterministic=mode == "deterministic")
+            for t in {*at, *(t + h for t in at for h in (1, 3))}
+        }
+        values = {t: round(float(e.returns.mean()), 1) for t, e in expected.items()}
+        assert found["true"] == pytest.approx([values[t + h] for t in at for h in (1, 3)], abs=0.11)
+        assert found["forecast"] == pytest.approx([values[t] for t in at for h in (1, 3)], abs=0.11)
 
 
-def test_the_page_stands_alone_and_says_who_wins(results: Path) -> None:
-    page = (results / "report.html").read_text()
-    assert page.count("<svg") == 2
+def test_gain_is_zero_for_the_copy_and_one_for_the_truth(results: dict[str, Any]) -> None:
+    for mode in ("sampled", "held", "deterministic"):
+        for row in results["forecasters"]["persistence"]["gain"][mode]:
+            assert row["value"] in (0, None)
+            assert row["forecast"] == row["now"]
+        floor = results["forecasters"]["reconstruction-8"]["gain"][mode]
+        assert [row["h"] for row in floor] == [1, 3]
+
+
+def test_held_noise_is_that_of_the_start(data: Path) -> None:
+    from tipl.evaluation.returns import hold_log_std
+
+    run = unseen(data)
+    held = hold_log_std(run, run.weights[30:33], np.array([3, 4, 5]))
+    place = run.layout["log_std"].slice
+    assert np.array_equal(held[:, place], run.weights[3:6][:, place])
+    rest = np.delete(np.arange(122), place)
+    assert np.array_equal(held[:, rest], run.weights[30:33][:, rest])
+
+
+# What is kept
+
+
+def test_nothing_is_measured_twice(
+    results: dict[str, Any], model: Path, config: EvaluateConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    real = Parts.get
+
+    def get(self: Parts, name: str, source: Any, function: Any) -> Any:
+        return real(self, name, source, lambda: made.append(name) or function())
+
+    monkeypatch.setattr(Parts, "get", get)
+    again = evaluate([load(model)], config)
+    assert made == []
+    assert json.loads(json.dumps(again)) == results
+    victim = config.out / "parts/weights/persistence/seed0002.npz"
+    victim.write_bytes(victim.read_bytes()[:200])  # as a full disk leaves it
+    assert json.loads(json.dumps(evaluate([load(model)], config))) == results
+    assert made == ["weights/persistence/seed0002"]
+
+
+def test_processes_find_the_same(
+    results: dict[str, Any], model: Path, config: EvaluateConfig, tmp_path: Path
+) -> None:
+    again = evaluate([load(model)], replace(config, out=tmp_path), workers=2)
+    assert json.loads(json.dumps(again)) == results
+
+
+# Pages
+
+
+def test_the_page_stands_alone_and_says_who_wins(
+    results: dict[str, Any], config: EvaluateConfig
+) -> None:
+    page = (config.out / "report.html").read_text()
+    assert page.count("<svg") == 4
     assert "TIPL loses to copying the last weights" in page
     for outside in ('src="http', 'href="http', "<script", "@import"):
         assert outside not in page
-    assert (results / "figure-sampled.png").stat().st_size > 10_000
+    pictures = list(config.out.glob("*.png"))
+    assert len(pictures) == 4
+    assert all(picture.stat().st_size > 10_000 for picture in pictures)
 
 
 @pytest.mark.parametrize(
-    ("skills", "word"), [((0.1, 0.2), "beats"), ((-1, -2), "loses to"), ((0.1, -1), "splits with")]
+    ("skills", "said"),
+    [
+        ((0.1, 0.2), "beats copying"),
+        ((-1, -2), "loses to copying"),
+        ((0.1, -1), "splits with copying"),
+        ((0.0, 0.0), "does not clearly differ from copying"),
+    ],
 )
-def test_the_verdict_is_plain(skills: tuple[float, float], word: str) -> None:
+def test_the_verdict_is_plain(skills: tuple[float, float], said: str) -> None:
+    def scores(rows: list[dict[str, Any]], repw: float) -> dict[str, Any]:
+        gaps = [{"h": 1, "value": repw, "low": None, "high": None}]
+        skill = {"ratio_of_sums": {"all": rows}}
+        return {
+            "floor": False,
+            "causal": False,
+            "skill": skill,
+            "repw": {"sampled": {"learning": gaps}},
+        }
+
     rows = [
         {"h": h, "value": v, "low": None, "high": None}
         for h, v in zip((1, 10), skills, strict=True)
     ]
-    repw = {"sampled": [{"h": 1, "value": 3.0}]}
-    copy = {"floor": False, "skill": rows, "repw": {"sampled": [{"h": 1, "value": 2.0}]}}
-    said = verdict(
-        {
-            "forecasters": {
-                "persistence": copy,
-                "tipl": {"floor": False, "skill": rows, "repw": repw},
-            }
-        }
-    )
-    assert f"TIPL {word} copying the last weights" in said
-    assert "larger (1.5 times the copy's)" in said
+    text = verdict({"forecasters": {"persistence": scores(rows, 2.0), "tipl": scores(rows, 3.0)}})
+    assert f"TIPL {said} the last weights" in text
+    assert "1.5 times the copy's" in text
 
 
-def test_runs_shorter_than_the_horizon_are_refused(small_dataset: Path, tmp_path: Path) -> None:
-    config = EvaluateConfig(data=small_dataset, out=tmp_path, max_horizon=49)
-    with pytest.raises(EvaluateError, match="more than 49 snapshots"):
+# Bad input
+
+
+def test_runs_that_are_too_short_are_refused(data: Path, tmp_path: Path) -> None:
+    config = EvaluateConfig(data=data, out=tmp_path, **SMALL | {"horizons": (49,)})
+    with pytest.raises(EvaluateError, match="more than 50 snapshots"):
         evaluate([], config)
+
+
+def test_horizons_beyond_half_a_run_are_left_out(data: Path, tmp_path: Path) -> None:
+    small = SMALL | {"horizons": (1, 24, 25), "learning_starts": 0, "function_starts": 0}
+    found = evaluate([], EvaluateConfig(data=data, out=tmp_path, **small))
+    assert found["horizons"] == [1, 24]
+    assert "gain" not in found["forecasters"]["persistence"]
+
+
+def test_runs_without_returns_are_refused(small_dataset: Path, tmp_path: Path) -> None:
+    config = EvaluateConfig(data=small_dataset, out=tmp_path / "out", **SMALL)
+    with pytest.raises(EvaluateError, match=r"(?s)no returns.*--learning-starts 0"):
+        evaluate([], config)
+    assert not (tmp_path / "out").exists()
+
+
+def test_equal_names_are_refused(model: Path, config: EvaluateConfig) -> None:
+    with pytest.raises(EvaluateError, match="the same name"):
+        evaluate([load(model), load(model)], config)
+
+
+def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no model at nothing"):
+        load("nothing")
+    (tmp_path / "config.json").write_text('{"kind": "crystal ball"}')
+    with pytest.raises(ModelError, match="crystal ball"):
+        load(tmp_path)
 
 
 def test_baselines_are_saved_and_loaded(tmp_path: Path) -> None:
     for forecaster in (Persistence(), Reconstruction(7)):
         forecaster.save(tmp_path / forecaster.name)
-        assert type(forecaster).load(tmp_path / forecaster.name) == forecaster
+        assert load(tmp_path / forecaster.name) == forecaster

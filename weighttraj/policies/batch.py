@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
+from torch.distributions import Categorical, Normal
 
 from weighttraj.format import ParamLayout, PolicySpec, Run
 from weighttraj.format.schema import ObsNorm
@@ -75,6 +76,15 @@ class PolicyBatch:
             hidden = activation(torch.baddbmm(bias, hidden, weight))
         weight, bias = self._layers[-1]
         return torch.baddbmm(bias, hidden, weight)
+
+    def distribution(
+        self, inputs: Float32[np.ndarray, "policy episode *obs"]
+    ) -> Normal | Categorical:
+        """Distributions over unclipped actions for network inputs, (policy, episode, ...)."""
+        outputs = self.outputs(inputs)
+        if self._std is None:
+            return Categorical(logits=outputs, validate_args=False)
+        return Normal(outputs, self._std.expand_as(outputs), validate_args=False)
 
     @torch.no_grad()
     def act(self, observations: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:

@@ -1,0 +1,59 @@
+"""What an evaluation measures, and how much of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+HORIZONS = (*range(1, 11), 20, 50, 100, 200)
+"""Snapshots ahead, as the results report them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """One evaluation."""
+
+    data: Path
+    """Data set: a path or an id."""
+    out: Path
+    """Folder of the results. What was measured before an interruption is kept there."""
+    split: Literal["train", "validation", "test"] = "test"
+    """Runs that are judged on."""
+    horizons: tuple[int, ...] = HORIZONS
+    """Snapshots ahead; those beyond half of the shortest run are left out."""
+    starts: int = 2_000
+    """Starts in each run, evenly spaced, for errors of weights; all if there are fewer."""
+    function_starts: int = 400
+    """Of these, starts for divergences of policies on stored observations; 0: none."""
+    return_horizons: tuple[int, ...] = (*range(1, 11), 20, 50, 100)
+    """Snapshots ahead for which returns are measured."""
+    learning_starts: int = 6
+    """Starts in each run's learning phase for returns; 0: no returns."""
+    plateau_starts: int = 3
+    """Starts after the learning phase for returns."""
+    episodes: int = 20
+    """Episodes for the return of one policy, the same seeds for all."""
+    bootstrap: int = 2_000
+    """Resamples of the runs for intervals."""
+    seed: int = 0
+    """Seed of episodes and resamples."""
+    quick: bool = False
+    """Fewer starts, episodes and horizons: minutes instead of hours."""
+
+    def bounded(self) -> EvaluateConfig:
+        """These settings, smaller if ``quick``."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            starts=min(self.starts, 300),
+            function_starts=min(self.function_starts, 50),
+            return_horizons=tuple(h for h in self.return_horizons if h in (1, 10, 50)),
+            learning_starts=min(self.learning_starts, 2),
+            plateau_starts=min(self.plateau_starts, 1),
+            episodes=min(self.episodes, 5),
+        )
+
+
+__all__ = ["HORIZONS", "EvaluateConfig"]

@@ -1,0 +1,202 @@
+"""Everything that is measured on one run: an engine's task."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tipl.evaluation.config import EvaluateConfig
+from tipl.evaluation.parts import Arrays, Parts, fingerprint, run_source
+from tipl.evaluation.returns import FRESH, MODES, Player, forecast_returns, true_returns
+from tipl.evaluation.starts import Starts, at_boundary, starts_of
+from tipl.evaluation.weights import Tick, divergences, squared_errors
+from tipl.forecast import Forecaster
+from weighttraj import Run, open_run
+from weighttraj.engine import Tell
+from weighttraj.threads import one_torch_thread
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One run on which forecasters are judged."""
+
+    path: Path
+    """The run."""
+    forecasters: tuple[Forecaster, ...]
+    """Who is judged; the first one is the copy."""
+    config: EvaluateConfig
+    """How."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """What was measured on one run."""
+
+    run: str
+    """Its id."""
+    starts: Starts
+    """Where forecasts started."""
+    boundary: np.ndarray
+    """bool (start,): whether the next step of a start for weights crosses into an iteration."""
+    function_starts: np.ndarray
+    """int (start,): the starts for divergences."""
+    function_boundary: np.ndarray
+    """bool (start,): the same of these."""
+    tensors: np.ndarray
+    """int (tensor,): parameters of each."""
+    weights: dict[str, Arrays]
+    """``squared`` by forecaster."""
+    functions: dict[str, Arrays]
+    """``kl`` by forecaster; empty without observations."""
+    true: Arrays
+    """``now``, ``later`` and ``fresh``; empty without returns."""
+    returns: dict[str, Arrays]
+    """``forecast`` by forecaster."""
+
+
+def measure(task: Task, tell: Tell) -> Measured:
+    """Measure what is not there yet.
+
+    ``tell`` hears what was done ("weights", "policies" or "returns"), and how much of it.
+    """
+    with one_torch_thread(), _Measurement(task, tell) as measurement:
+        return measurement.all()
+
+
+def function_starts(starts: Starts, config: EvaluateConfig) -> np.ndarray:
+    """Some of the starts for weights, evenly."""
+    count = min(config.function_starts, len(starts.weights))
+    chosen = np.linspace(0, len(starts.weights) - 1, count).round().astype(int)
+    return np.asarray(starts.weights[np.unique(chosen)])
+
+
+class _Measurement(contextlib.ExitStack):
+    def __init__(self, task: Task, tell: Tell) -> None:
+        super().__init__()
+        self._task, self._config, self._tell = task, task.config, tell
+        self._run: Run = open_run(task.path)
+        self._parts = Parts(task.config.out / "parts")
+        self._starts = starts_of(self._run, task.config)
+        self._source = run_source(self._run)
+        self._marks = {f.name: fingerprint(f) for f in task.forecasters}
+        self._players: dict[int, Player] = {}
+
+    def all(self) -> Measured:
+        """Everything."""
+        starts, config = self._starts, self._config
+        chosen = function_starts(starts, config)
+        weights, functions = {}, {}
+        for forecaster in self._task.forecasters:
+            weights[forecaster.name] = self._get(
+                "weights", forecaster, starts.weights, config.horizons, squared_errors
+            )
+            if len(chosen):
+                functions[forecaster.name] = self._get(
+                    "policies", forecaster, chosen, config.horizons, divergences
+                )
+        return Measured(
+            run=self._run.id,
+            starts=starts,
+            boundary=at_boundary(self._run, starts.weights),
+            function_starts=chosen,
+            function_boundary=at_boundary(self._run, chosen),
+            tensors=np.array([param.size for param in self._run.layout.params]),
+            weights=weights,
+            functions=functions,
+            true=self._true() if config.learning_starts else {},
+            returns={f.name: self._returns(f) for f in self._task.forecasters}
+            if config.learning_starts
+            else {},
+        )
+
+    def _get(
+        self,
+        what: str,
+        forecaster: Forecaster,
+        starts: np.ndarray,
+        horizons: Sequence[int],
+        function: Any,
+    ) -> Arrays:
+        return self._kept(
+            f"{what}/{forecaster.name}/{self._run.id}",
+            self._source
+            | {"forecaster": self._marks[forecaster.name]}
+            | {"starts": starts.tolist(), "horizons": list(horizons)},
+            lambda tick: function(forecaster, self._run, starts, horizons, tick),
+            (what, len(starts)),
+        )
+
+    def _kept(
+        self,
+        name: str,
+        source: dict[str, Any],
+        function: Callable[[Tick], Arrays],
+        work: tuple[str, int],
+    ) -> Arrays:
+        """Arrays that are there, or are made now; tells of so much work in either case."""
+        what, count = work
+        done: list[int] = []
+
+        def tick(some: int) -> None:
+            done.append(some)
+            self._tell(what, some)
+
+        arrays = self._parts.get(name, source, lambda: function(tick))
+        self._tell(what, count - sum(done))
+        return arrays
+
+    def _player(self, seed: int) -> Player:
+        if seed not in self._players:
+            player = Player(self._run, self._config.episodes, seed)
+            self._players[seed] = self.enter_context(player)
+        return self._players[seed]
+
+    def _return_starts(self) -> np.ndarray:
+        return np.concatenate([self._starts.learning, self._starts.plateau])
+
+    def _played(self, **more: Any) -> dict[str, Any]:
+        config = self._config
+        return self._source | {
+            "starts": self._return_starts().tolist(),
+            "horizons": list(config.return_horizons),
+            "episodes": config.episodes,
+            "seed": config.seed,
+            **more,
+        }
+
+    def _true(self) -> Arrays:
+        starts, config = self._return_starts(), self._config
+        arms, horizons = (self._run, starts), config.return_horizons
+
+        def play(tick: Tick) -> Arrays:
+            found = true_returns(self._player(config.seed), *arms, horizons, tick)
+            fresh = self._player(config.seed + FRESH)
+            again = true_returns(fresh, *arms, horizons[:1], lambda _: None)
+            return found | {"fresh": again["later"]}
+
+        count = len(MODES) * len(starts) * (1 + len(horizons))
+        return self._kept(f"returns/true/{self._run.id}", self._played(), play, ("returns", count))
+
+    def _returns(self, forecaster: Forecaster) -> Arrays:
+        starts, config = self._return_starts(), self._config
+        return self._kept(
+            f"returns/{forecaster.name}/{self._run.id}",
+            self._played(forecaster=self._marks[forecaster.name]),
+            lambda tick: forecast_returns(
+                forecaster,
+                self._player(config.seed),
+                self._run,
+                starts,
+                config.return_horizons,
+                tick,
+            ),
+            ("returns", len(MODES) * len(starts) * len(config.return_horizons)),
+        )
+
+
+__all__ = ["Measured", "Task", "function_starts", "measure"]

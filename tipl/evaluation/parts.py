@@ -1,0 +1,82 @@
+"""What was measured of a forecaster on a run: kept on disk, so that it is measured once."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tipl.forecast import Forecaster
+from weighttraj import Run
+
+Arrays = dict[str, np.ndarray]
+
+
+class Parts:
+    """A folder of measurements. Each says what it was made from; what no longer fits is made anew.
+
+    Args:
+        folder: it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def get(self, name: str, source: dict[str, Any], measure: Callable[[], Arrays]) -> Arrays:
+        """The arrays of a measurement, made if they are not there.
+
+        Args:
+            name: path in the folder, without suffix.
+            source: JSON of all that the arrays depend on.
+            measure: makes them.
+        """
+        path = self._folder / f"{name}.npz"
+        wanted = json.dumps(source, sort_keys=True, default=str)
+        if (arrays := _read(path, wanted)) is None:
+            arrays = measure()
+            _write(path, wanted, arrays)
+        return arrays
+
+
+def run_source(run: Run) -> dict[str, Any]:
+    """What tells a run from any other."""
+    return {"run": run.id, "digest": hashlib.sha256(run["digest"][:].tobytes()).hexdigest()}
+
+
+def fingerprint(forecaster: Forecaster) -> str:
+    """Hash of all that a forecaster saves of itself."""
+    digest = hashlib.sha256()
+    with tempfile.TemporaryDirectory() as folder:
+        forecaster.save(folder)
+        for file in sorted(Path(folder).rglob("*")):
+            if file.is_file():
+                digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path, wanted: str) -> Arrays | None:
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (FileNotFoundError, ValueError, OSError, EOFError, zipfile.BadZipFile):
+        return None  # absent, or cut short
+    return arrays if str(arrays.pop("source", "")) == wanted else None
+
+
+def _write(path: Path, source: str, arrays: Arrays) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, source=np.array(source), **arrays)  # type: ignore[arg-type]
+    draft = path.with_suffix(".draft")
+    draft.write_bytes(buffer.getvalue())
+    draft.replace(path)
+
+
+__all__ = ["Arrays", "Parts", "fingerprint", "run_source"]

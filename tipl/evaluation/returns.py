@@ -1,0 +1,137 @@
+"""Returns of forecast policies beside those of the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from tipl.evaluation.parts import Arrays
+from tipl.evaluation.weights import Tick
+from tipl.forecast import Forecaster
+from weighttraj import Run
+from weighttraj.policies import Evaluator, PolicyBatch, env_of, load_policies
+
+MODES = ("sampled", "held", "deterministic")
+"""How policies act: samples; samples with the exploration noise ``log_std`` of the start, in every
+arm; the distribution's mode."""
+FRESH = 10_000
+"""Added to the seeds of episodes that only serve to measure how noisy a return is."""
+
+
+class Player:
+    """Mean returns of policies of one run; equal policies play once.
+
+    Args:
+        run: the run.
+        episodes: for each policy, the same seeds for all.
+        seed: of the first.
+    """
+
+    def __init__(self, run: Run, episodes: int, seed: int) -> None:
+        self._run = run
+        self._evaluator = Evaluator(env_of(run), episodes=episodes, seed=seed)
+        self._known: dict[tuple[bool, bytes], float] = {}
+
+    def __enter__(self) -> Player:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._evaluator.close()
+
+    def returns(
+        self,
+        policies: PolicyBatch,
+        starts: Int[np.ndarray, " policy"],
+        tick: Tick = lambda _: None,
+    ) -> Float[np.ndarray, "mode policy"]:
+        """Mean returns in each of ``MODES``.
+
+        Args:
+            policies: to be played.
+            starts: the snapshot whose ``log_std`` each has in the mode ``held``.
+            tick: called with a number of policies that have played.
+        """
+        held = policies.with_weights(hold_log_std(self._run, policies.weights, starts))
+        arms = {"sampled": policies, "held": held, "deterministic": policies}
+        found = []
+        for mode in MODES:
+            found.append(self._play(arms[mode], deterministic=mode == "deterministic"))
+            tick(len(policies))
+        return np.stack(found)
+
+    def _play(self, policies: PolicyBatch, *, deterministic: bool) -> Float[np.ndarray, " policy"]:
+        keys = [(deterministic, key) for key in _keys(policies)]
+        rows = {key: row for row, key in enumerate(keys) if key not in self._known}
+        if rows:
+            some = policies[list(rows.values())]
+            played = self._evaluator(some, deterministic=deterministic).returns.mean(1)
+            self._known |= dict(zip(rows, played.tolist(), strict=True))
+        return np.array([self._known[key] for key in keys])
+
+
+def true_returns(
+    player: Player, run: Run, starts: Int[np.ndarray, " start"], horizons: Sequence[int], tick: Tick
+) -> Arrays:
+    """Returns of the policies at the starts, and of those that training made of them.
+
+    Returns:
+        ``now``: float64 (mode, start); ``later``: (mode, start, horizon).
+    """
+    now = player.returns(load_policies(run, starts), starts, tick)
+    policies = load_policies(run, (starts[:, None] + np.asarray(horizons)).ravel())
+    later = player.returns(policies, np.repeat(starts, len(horizons)), tick)
+    return {"now": now, "later": later.reshape(len(MODES), len(starts), len(horizons))}
+
+
+def forecast_returns(
+    forecaster: Forecaster,
+    player: Player,
+    run: Run,
+    starts: Int[np.ndarray, " start"],
+    horizons: Sequence[int],
+    tick: Tick,
+) -> Arrays:
+    """Returns of forecast policies.
+
+    They act with the normaliser of the start: the later one is the future's. A floor, which is no
+    forecast, acts with the later one.
+
+    Returns:
+        ``forecast``: float64 (mode, start, horizon).
+    """
+    weights = forecaster.forecast(run, starts.tolist(), list(horizons))
+    at = np.repeat(starts, len(horizons))
+    rows = (starts[:, None] + np.asarray(horizons)).ravel() if is_floor(forecaster) else at
+    policies = load_policies(run, rows).with_weights(weights.reshape(len(at), -1))
+    found = player.returns(policies, at, tick)
+    return {"forecast": found.reshape(len(MODES), len(starts), len(horizons))}
+
+
+def is_floor(forecaster: Any) -> bool:
+    """Whether it shows the truth through a representation, and forecasts nothing."""
+    return bool(getattr(forecaster, "floor", False))
+
+
+def hold_log_std(
+    run: Run, weights: Float32[np.ndarray, "policy param"], starts: Int[np.ndarray, " policy"]
+) -> Float32[np.ndarray, "policy param"]:
+    """The weights with the exploration noise of other snapshots of the run."""
+    names = [param.name for param in run.layout.params]
+    if "log_std" not in names:
+        return weights
+    place = run.layout["log_std"].slice
+    held = weights.copy()
+    held[:, place] = run.weights[starts][:, place]
+    return held
+
+
+def _keys(policies: PolicyBatch) -> list[bytes]:
+    """What tells one policy from another: its weights and its normaliser."""
+    parts = [x for x in (policies.weights, policies.mean, policies.var) if x is not None]
+    return [b"".join([part[row].tobytes() for part in parts]) for row in range(len(policies))]
+
+
+__all__ = ["FRESH", "MODES", "Player", "forecast_returns", "is_floor", "true_returns"]

@@ -1,0 +1,95 @@
+"""From where forecasts start: all moments for weights, the learning phase for returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from tipl.errors import EvaluateError
+from tipl.evaluation.config import EvaluateConfig
+from weighttraj import Run
+
+LEARNED = 0.95
+"""Share of the way from the first to the final return at which the learning phase ends."""
+_HISTORY = 10
+"""Snapshots that a forecast of returns may look back on, at least."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Starts:
+    """Where forecasts of one run start, and how far they go."""
+
+    weights: Int[np.ndarray, " start"]
+    """For errors of weights: each has all horizons after it."""
+    learning: Int[np.ndarray, " learning_start"]
+    """For returns, within the learning phase."""
+    plateau: Int[np.ndarray, " plateau_start"]
+    """For returns, after it."""
+
+
+def starts_of(run: Run, config: EvaluateConfig) -> Starts:
+    """The starts of a run.
+
+    Raises:
+        EvaluateError: the run is too short, or it has no returns that tell when it has learned.
+    """
+    last = len(run) - 1 - max(config.horizons)
+    if last < 1:
+        raise EvaluateError(
+            "a run is too short to be forecast",
+            expected=f"more than {max(config.horizons) + 1} snapshots",
+            got=len(run),
+            where=run.path,
+            do="choose smaller --horizons, or collect longer runs",
+        )
+    none = np.zeros(0, int)
+    if not config.learning_starts:
+        return Starts(weights=_spread(0, last, config.starts), learning=none, plateau=none)
+    end = len(run) - 1 - max(config.return_horizons)
+    learned = min(learning_phase(run), end - 1)
+    first = min(_HISTORY, learned // 4)
+    inside = np.linspace(first, learned, config.learning_starts + 2)[1:-1]
+    return Starts(
+        weights=_spread(0, last, config.starts),
+        learning=np.unique(inside.round().astype(int)),
+        plateau=_spread(learned, end, config.plateau_starts + 1)[1:],
+    )
+
+
+def learning_phase(run: Run) -> int:
+    """The first snapshot whose return has come 95 % of the way from the first to the final one.
+
+    The final return is the median over the last quarter of what was evaluated. Sampled actions,
+    if they are stored: deterministic returns can jump.
+
+    Raises:
+        EvaluateError: the run has no returns.
+    """
+    if run.evaluation is None:
+        raise EvaluateError(
+            "the runs have no returns, so nothing tells when they have learned",
+            expected="returns of the stored policies",
+            where=run.path,
+            do="weighttraj returns DATASET, or --learning-starts 0 to judge weights only",
+        )
+    mean = run.mean_return(deterministic=False not in run.evaluation.deterministic)
+    rows = np.flatnonzero(np.isfinite(mean))
+    final = np.median(mean[rows[-max(1, len(rows) // 4) :]])
+    reached = (mean[rows] - mean[rows[0]]) >= LEARNED * (final - mean[rows[0]])
+    return int(rows[np.flatnonzero(reached)[0]]) if final > mean[rows[0]] else 0
+
+
+def at_boundary(run: Run, starts: Int[np.ndarray, " start"]) -> Bool[np.ndarray, " start"]:
+    """Whether the step after a start belongs to the next iteration: new data arrive before it."""
+    iteration = run.iteration
+    return np.asarray(iteration[starts + 1] != iteration[starts])
+
+
+def _spread(first: int, last: int, count: int) -> Int[np.ndarray, " start"]:
+    """So many integers, evenly from the first to the last."""
+    return np.unique(np.linspace(first, last, min(count, last - first + 1)).round().astype(int))
+
+
+__all__ = ["LEARNED", "Starts", "at_boundary", "learning_phase", "starts_of"]

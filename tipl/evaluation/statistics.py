@@ -1,0 +1,95 @@
+"""Ratios of sums over runs, with intervals that resample the runs.
+
+Runs are what is independent: snapshots of one run are not. So each interval is a percentile
+bootstrap over runs (Efron, 1979), as the aggregates of Agarwal et al., "Deep Reinforcement Learning
+at the Edge of the Statistical Precipice" (NeurIPS 2021), whose interquartile mean is here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+Interval = dict[str, float | None]
+"""``value``, and the ends ``low`` and ``high`` of its 95 % interval; None with a single run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bootstrap:
+    """Draws runs with replacement."""
+
+    resamples: int
+    """How often."""
+    seed: int
+    """Of the draws."""
+
+    def interval(
+        self,
+        statistic: Callable[..., Float[np.ndarray, "*cell"]],
+        *samples: Float[np.ndarray, "run *shape"],
+    ) -> list[Interval]:
+        """A statistic of all runs, for each of its cells in order.
+
+        Args:
+            statistic: called with the samples, or with drawn runs of all of them.
+            samples: the first axis is the run.
+        """
+        value, runs = statistic(*samples), len(samples[0])
+        drawn = []
+        if runs > 1:
+            picks = np.random.default_rng(self.seed).integers(runs, size=(self.resamples, runs))
+            drawn = [statistic(*(sample[pick] for sample in samples)) for pick in picks]
+        return _intervals(value, drawn)
+
+
+def ratio_of_sums(
+    numerator: Float[np.ndarray, "run *cell"], denominator: Float[np.ndarray, "run *cell"]
+) -> Float[np.ndarray, "*cell"]:
+    """Sum over runs of the one by that of the other; NaN where there is nothing to divide by."""
+    return quotient(numerator.sum(0), denominator.sum(0))
+
+
+def quotient(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    """The one by the other; NaN where there is nothing to divide by."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.asarray(numerator / denominator)
+    return np.where(denominator == 0, np.nan, ratio)
+
+
+def mean(values: Float[np.ndarray, "run *cell"]) -> Float[np.ndarray, "*cell"]:
+    """Mean over runs; NaN are left out."""
+    counted = np.isfinite(values)
+    return quotient(np.where(counted, values, 0.0).sum(0), counted.sum(0))
+
+
+def interquartile_mean(values: Float[np.ndarray, "run *cell"]) -> Float[np.ndarray, "*cell"]:
+    """Mean of the middle half over the first axis; runs at its edges count in part.
+
+    >>> float(interquartile_mean(np.array([0.0, 1.0, 2.0, 100.0])))
+    1.5
+    """
+    n = len(values)
+    ranks = np.arange(n)
+    share = np.clip(np.minimum(ranks + 1, 0.75 * n) - np.maximum(ranks, 0.25 * n), 0, None)
+    return np.tensordot(share / share.sum(), np.sort(values, axis=0), axes=1)
+
+
+def _intervals(value: np.ndarray, drawn: list[np.ndarray]) -> list[Interval]:
+    values = np.ravel(value).tolist()
+    if not drawn:
+        return [{"value": _plain(v), "low": None, "high": None} for v in values]
+    low, high = np.quantile(np.stack([np.ravel(d) for d in drawn]), (0.025, 0.975), axis=0)
+    return [
+        {"value": _plain(v), "low": _plain(a), "high": _plain(b)}
+        for v, a, b in zip(values, low.tolist(), high.tolist(), strict=True)
+    ]
+
+
+def _plain(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+__all__ = ["Bootstrap", "Interval", "interquartile_mean", "mean", "quotient", "ratio_of_sums"]

@@ -1,0 +1,201 @@
+"""From what was measured on each run to the figures that are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tipl.evaluation.config import EvaluateConfig
+from tipl.evaluation.measure import Measured
+from tipl.evaluation.returns import MODES
+from tipl.evaluation.statistics import (
+    Bootstrap,
+    Interval,
+    interquartile_mean,
+    mean,
+    quotient,
+    ratio_of_sums,
+)
+
+KINDS = ("all", "within", "boundary")
+"""Starts: all; those whose next step stays in the iteration; those whose next step leaves it."""
+AGGREGATES = ("ratio_of_sums", "mean_of_ratios", "tensors_equal")
+"""Skill: of the summed errors; the mean over starts of each one's; the mean over tensors."""
+PHASES = ("learning", "plateau")
+
+Errors = Float[np.ndarray, "run start horizon *tensor"]
+Chosen = Bool[np.ndarray, "run start"]
+
+
+class Summary:
+    """Figures of forecasters over runs.
+
+    Args:
+        measured: what was measured, run by run.
+        config: how.
+        copy: name of the forecaster that every other is compared with.
+    """
+
+    def __init__(self, measured: Sequence[Measured], config: EvaluateConfig, copy: str) -> None:
+        self._measured, self._config, self._copy = measured, config, copy
+        self._bootstrap = Bootstrap(resamples=config.bootstrap, seed=config.seed)
+
+    def of(self, name: str) -> dict[str, Any]:
+        """All figures of one forecaster."""
+        scores: dict[str, Any] = {"skill": self._skills(name), "wpe": self._wpe(name)}
+        if self._measured[0].functions:
+            scores["function_skill"] = self._function_skills(name)
+        if self._measured[0].true:
+            scores["repw"] = self._repw(name)
+            scores["gain"] = self._gain(name)
+            scores["scatter"] = self._scatter(name)
+        return scores
+
+    def noise(self) -> dict[str, float]:
+        """Mean difference between a true policy's returns over two sets of episodes, by mode."""
+        gaps = [np.abs(m.true["later"][:, :, :1] - m.true["fresh"]) for m in self._measured]
+        each = np.concatenate(gaps, axis=1).mean((1, 2))
+        return dict(zip(MODES, each.tolist(), strict=True))
+
+    def _skills(self, name: str) -> dict[str, Any]:
+        boundary = np.stack([m.boundary for m in self._measured])
+        error = np.stack([m.weights[name]["squared"] for m in self._measured])
+        copy = np.stack([m.weights[self._copy]["squared"] for m in self._measured])
+        return {
+            aggregate: {
+                kind: self._rows(
+                    self._config.horizons,
+                    self._bootstrap.interval(
+                        _SKILLS[aggregate], *_summed(aggregate, error, copy, chosen)
+                    ),
+                )
+                for kind, chosen in _kinds(boundary).items()
+            }
+            for aggregate in AGGREGATES
+        }
+
+    def _function_skills(self, name: str) -> dict[str, Any]:
+        boundary = np.stack([m.function_boundary for m in self._measured])
+        error = np.stack([m.functions[name]["kl"] for m in self._measured])[..., None]
+        copy = np.stack([m.functions[self._copy]["kl"] for m in self._measured])[..., None]
+        return {
+            kind: self._rows(
+                self._config.horizons,
+                self._bootstrap.interval(_skill, *_summed("ratio_of_sums", error, copy, chosen)),
+            )
+            for kind, chosen in _kinds(boundary).items()
+        }
+
+    def _wpe(self, name: str) -> list[dict[str, Any]]:
+        size = self._measured[0].tensors.sum()
+        each = [m.weights[name]["squared"].sum(2).mean(0) / size for m in self._measured]
+        return self._rows(self._config.horizons, self._bootstrap.interval(mean, np.stack(each)))
+
+    def _repw(self, name: str) -> dict[str, Any]:
+        """|J(true) - J(forecast)|, means over the starts of each run."""
+        found: dict[str, Any] = {}
+        for i, mode in enumerate(MODES):
+            found[mode] = {}
+            for phase in PHASES:
+                gaps = [
+                    _mean(np.abs(later - forecast))
+                    for _, later, forecast in self._arms(name, i, phase)
+                ]
+                found[mode][phase] = self._rows(
+                    self._config.return_horizons, self._bootstrap.interval(mean, np.stack(gaps))
+                )
+        return found
+
+    def _gain(self, name: str) -> dict[str, Any]:
+        """What a forecast earns of what training earns, over the learning phase."""
+        found = {}
+        for i, mode in enumerate(MODES):
+            arms = list(self._arms(name, i, "learning"))
+            earned = np.stack([(forecast - now[:, None]).sum(0) for now, _, forecast in arms])
+            trained = np.stack([(later - now[:, None]).sum(0) for now, later, _ in arms])
+            rows = self._rows(
+                self._config.return_horizons,
+                self._bootstrap.interval(ratio_of_sums, earned, trained),
+            )
+            now, later, forecast = (
+                interquartile_mean(np.concatenate(arm))
+                for arm in zip(
+                    *((np.repeat(a[:, None], b.shape[1], 1), b, c) for a, b, c in arms),
+                    strict=True,
+                )
+            )
+            for j, row in enumerate(rows):
+                row |= {"now": float(now[j]), "later": float(later[j])}
+                row |= {"forecast": float(forecast[j])}
+            found[mode] = rows
+        return found
+
+    def _scatter(self, name: str) -> dict[str, Any]:
+        """Returns of true and forecast policies, for the paper's horizons."""
+        near = [i for i, h in enumerate(self._config.return_horizons) if h <= 10]
+        return {
+            mode: [
+                {
+                    "run": m.run,
+                    "true": m.true["later"][i][:, near].round(1).ravel().tolist(),
+                    "forecast": m.returns[name]["forecast"][i][:, near].round(1).ravel().tolist(),
+                }
+                for m in self._measured
+            ]
+            for i, mode in enumerate(MODES)
+            if mode != "held"
+        }
+
+    def _arms(self, name: str, mode: int, phase: str) -> Any:
+        """Returns now (start,), later and of the forecast (start, horizon), run by run."""
+        for m in self._measured:
+            n = len(m.starts.learning)
+            part = slice(None, n) if phase == "learning" else slice(n, None)
+            arms = m.true["now"], m.true["later"], m.returns[name]["forecast"]
+            yield tuple(arm[mode][part] for arm in arms)
+
+    def _rows(self, horizons: Sequence[int], cells: list[Interval]) -> list[dict[str, Any]]:
+        return [{"h": h, **cell} for h, cell in zip(horizons, cells, strict=True)]
+
+
+def _kinds(boundary: Chosen) -> dict[str, Chosen]:
+    return dict(zip(KINDS, (np.ones_like(boundary), ~boundary, boundary), strict=True))
+
+
+def _summed(aggregate: str, error: Errors, copy: Errors, chosen: Chosen) -> tuple[Any, ...]:
+    """What a skill is computed from: a row for each run, so that runs can be drawn."""
+    weight = chosen[:, :, None, None]
+    if aggregate == "mean_of_ratios":
+        ratios = 1 - quotient(error.sum(3), copy.sum(3))
+        return (np.stack([_mean(r[c]) for r, c in zip(ratios, chosen, strict=True)]),)
+    sums = (np.where(weight, each, 0.0).sum(1) for each in (error, copy))
+    if aggregate == "ratio_of_sums":
+        return tuple(each.sum(2) for each in sums)
+    return tuple(sums)
+
+
+def _skill(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
+    return np.asarray(1 - ratio_of_sums(error, copy))
+
+
+def _skill_of_tensors(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
+    each = 1 - ratio_of_sums(error, copy)  # (horizon, tensor); NaN: it never moves
+    return mean(np.moveaxis(each, 1, 0))
+
+
+_SKILLS: dict[str, Callable[..., np.ndarray]] = {
+    "ratio_of_sums": _skill,
+    "mean_of_ratios": mean,
+    "tensors_equal": _skill_of_tensors,
+}
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Mean over the first axis; NaN where there is nothing."""
+    return mean(values) if len(values) else np.full(values.shape[1:], np.nan)
+
+
+__all__ = ["AGGREGATES", "KINDS", "PHASES", "Summary"]

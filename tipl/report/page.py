@@ -1,0 +1,36 @@
+"""Results as one page that opens from disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from tipl.report.figures import figures, svg
+from tipl.report.tables import cell, headline, label, tables, verdict
+
+
+def write_report(results: dict[str, Any], out: Path) -> Path:
+    """Write the page and the figures beside ``results.json``; returns the page's path."""
+    drawn = figures(results)
+    for title, figure in drawn.items():
+        name = title.lower().replace("'", "").replace(",", "").replace(" ", "-")
+        figure.savefig(out / f"{name}.png", dpi=150)
+    loader = jinja2.PackageLoader("tipl", "templates")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
+    page = environment.get_template("report.html").render(
+        results=results,
+        verdict=verdict(results),
+        overview=headline(results)[0],
+        tables=tables(results),
+        figures={title: svg(figure) for title, figure in drawn.items()},
+        label=label,
+        cell=cell,
+    )
+    path = out / "report.html"
+    path.write_text(page)
+    return path
+
+
+__all__ = ["write_report"]
