@@ -26,6 +26,8 @@ except WeightTrajError as error:
 
 app = tyro.extras.SubcommandApp()
 console = Console()
+_WIDE = 150
+"""Characters that a table with intervals needs."""
 
 
 @app.command(name="train")
@@ -81,7 +83,9 @@ def _table(results: dict[str, Any]) -> Table:
     for column in overview.columns:
         table.add_column(column, justify="right")
     for name, cells in overview.rows:
-        table.add_row(report.label(name), *(escape(cell(row)) for row in cells))
+        # Intervals where there is room; the report has them all.
+        shown = (cell(row, interval=console.width >= _WIDE) for row in cells)
+        table.add_row(report.label(name), *(escape(text) for text in shown))
     return table
 
 

@@ -81,12 +81,12 @@ def label(name: str) -> str:
     return LABELS.get(name, name.replace("reconstruction-", "floor, rank "))
 
 
-def cell(row: Row | None, digits: int = 2) -> str:
-    """A value with its interval."""
+def cell(row: Row | None, digits: int = 2, *, interval: bool = True) -> str:
+    """A value, with its interval."""
     if row is None or row["value"] is None:
         return "-"
     text = _number(row["value"], digits)
-    if row["low"] is not None and row["low"] != row["high"]:
+    if interval and row["low"] is not None and row["low"] != row["high"]:
         text += f" [{_number(row['low'], digits)}, {_number(row['high'], digits)}]"
     return text
 
@@ -170,7 +170,7 @@ def _sentences(results: dict[str, Any], name: str) -> Iterator[str]:
         f"In weight error, {label(name)} {relation} copying the last weights: skill "
         f"{cell(first)} at h = {first['h']}, {cell(last)} at h = {last['h']}."
     )
-    for mode, phases in scores.get("repw", {}).items():
+    for mode in scores.get("repw", {}):
         if mode == "held":
             continue
         ours, theirs = (
@@ -180,7 +180,6 @@ def _sentences(results: dict[str, Any], name: str) -> Iterator[str]:
         yield (
             f"In return while learning ({MODE_NAMES[mode]}), its REPW over all horizons is {ratio}."
         )
-        del phases
 
 
 def _sign(row: Row) -> int:
