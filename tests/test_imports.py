@@ -172,7 +172,7 @@ ALLOWED = {
     ],
     "weighttraj": [FORMAT],
     "tipl.errors": ["weighttraj.errors"],
-    "tipl.representation": ["tipl.errors"],
+    "tipl.representation": ["tipl.errors", "tipl.representation", "door weighttraj"],
     "tipl.models": ["tipl.models"],
     "tipl.tokens": ["tipl.errors", "tipl.representation"],
     "tipl.forecast": [
@@ -182,7 +182,15 @@ ALLOWED = {
         "tipl.tokens",
         "door weighttraj",
     ],
-    "tipl.baselines": ["tipl.forecast", "tipl.representation", "door weighttraj"],
+    "tipl.baselines": [
+        "tipl.baselines",
+        "tipl.errors",
+        "tipl.forecast",
+        "tipl.representation",
+        "door weighttraj",
+        "weighttraj.threads",
+    ],
+    "tipl.checks": ["tipl.forecast", "door weighttraj"],
     "tipl.train": [
         "tipl.errors",
         "tipl.forecast",

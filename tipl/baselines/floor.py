@@ -1,8 +1,7 @@
-"""What a model must beat, and the floor that no model in its basis can pass."""
+"""The floor under every model that predicts coefficients: no forecast, but what a basis loses."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,35 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from tipl.baselines.files import read_config, write
 from tipl.forecast import check_request
 from tipl.representation import TemporalSVD
 from weighttraj import Run
-
-
-@dataclass(frozen=True)
-class Persistence:
-    """Copies the last weights: the forecast of phi_{t+h} is phi_t."""
-
-    name = "persistence"
-    causal = True
-
-    def forecast(
-        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
-    ) -> Float32[np.ndarray, "start horizon param"]:
-        """phi_t, once a horizon."""
-        check_request(run, starts, horizons)
-        last = run.weights[np.asarray(starts)]
-        return np.repeat(last[:, None], len(horizons), axis=1)
-
-    def save(self, path: str | Path) -> None:
-        """Write config.json; there is nothing fitted."""
-        Path(path).mkdir(parents=True, exist_ok=True)
-        (Path(path) / "config.json").write_text(json.dumps({"kind": self.name}))
-
-    @classmethod
-    def load(cls, path: str | Path) -> Persistence:
-        """A new one."""
-        return cls()
 
 
 @dataclass(frozen=True)
@@ -50,6 +24,7 @@ class Reconstruction:
 
     rank: int
     """Rank of the basis."""
+    kind = "reconstruction"
     causal = False
     floor = True
 
@@ -70,12 +45,17 @@ class Reconstruction:
 
     def save(self, path: str | Path) -> None:
         """Write config.json."""
-        Path(path).mkdir(parents=True, exist_ok=True)
-        (Path(path) / "config.json").write_text(
-            json.dumps({"kind": "reconstruction", "rank": self.rank})
-        )
+        write(path, {"kind": self.kind, "rank": self.rank})
 
     @classmethod
     def load(cls, path: str | Path) -> Reconstruction:
-        """Read the rank."""
-        return cls(json.loads((Path(path) / "config.json").read_text())["rank"])
+        """Read the rank.
+
+        Raises:
+            FileNotFoundError: there is no forecaster in the folder.
+            ModelError: the folder holds another one.
+        """
+        return read_config(path, cls.kind, cls)
+
+
+__all__ = ["Reconstruction"]

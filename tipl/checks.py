@@ -1,0 +1,334 @@
+"""Five tests that a causal forecaster should pass, as numbers.
+
+- *null*: fitted to random walks and scored on others, its skill is 0 at every horizon.
+- *causality*: what comes after t moves no bit of the forecast from t.
+- *equivariance*: a policy with its hidden units in another order, or with the signs around tanh
+  units flipped, is the same policy; the forecast follows.
+- *scale*: steps c times as long give a displacement c times as long.
+- *drift*: a run on a straight line is forecast exactly. Only trends must pass this one: a fit to
+  runs that do not move on lines shrinks every step.
+
+Runs for the tests are real ones on disk, made from an array of weights and what another run says
+of its layout, cadence and normalisers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int
+
+from tipl.forecast import Forecaster
+from weighttraj import ParamLayout, Run, RunWriter, open_run
+
+Fit = Callable[[Sequence[Run]], Forecaster]
+"""Fits a forecaster to runs."""
+
+NULL = 0.02
+"""Largest skill, up or down, that passes on random walks."""
+TOLERANCE = 1e-3
+"""Largest error, relative to the displacement, that passes. Float32 keeps a weight of 0.5 to 3e-8,
+a step of 1e-4 thus to 3e-4; sums in another order differ by less."""
+GRID = 2.0**-20
+"""Weights of test runs are multiples of this, so that float32 holds sums and doubles exactly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checks:
+    """What the tests measured of one forecaster. Numbers are for cards; ``passed`` judges them."""
+
+    null: dict[int, float]
+    """Skill at each horizon on random walks."""
+    causality: bool
+    """Whether the forecast is the same to the last bit, whatever comes later."""
+    permutation: float
+    """Error after a permutation of hidden units, relative to the displacement."""
+    sign: float | None
+    """Error after a flip of signs; None: the policy has no odd units."""
+    scale: float
+    """Error after all steps were doubled."""
+    drift: float
+    """Error on a straight line."""
+
+    @property
+    def passed(self) -> dict[str, bool]:
+        """Verdict of each test."""
+        return {
+            "null": all(abs(skill) < NULL for skill in self.null.values()),
+            "causality": self.causality,
+            "permutation": self.permutation < TOLERANCE,
+            "sign": self.sign is None or self.sign < TOLERANCE,
+            "scale": self.scale < TOLERANCE,
+            "drift": self.drift < TOLERANCE,
+        }
+
+
+def check(
+    forecaster: Forecaster,
+    run: Run,
+    folder: Path,
+    *,
+    fit: Fit | None = None,
+    horizons: Sequence[int] = (1, 2, 5, 10),
+    seed: int = 0,
+) -> Checks:
+    """All five tests.
+
+    Args:
+        forecaster: what is tested, fitted to real runs.
+        run: a run of the kind that it was fitted to; the tests alter copies of it.
+        folder: the copies are written there.
+        fit: fits such a forecaster to runs, for the null; None: there is nothing to fit.
+        horizons: how far to look.
+        seed: of walks and symmetries.
+    """
+    walks = random_walks(run, folder, seed=seed)
+    walker = forecaster if fit is None else fit(walks[2:])
+    last = len(run) - 1 - max(horizons)
+    starts = sorted({last // 4, last // 2, last})
+    where = (run, folder, starts, horizons)
+    odd = run.info.policy.activation == "tanh"
+    return Checks(
+        null=dict(zip(horizons, skills(walker, walks[:2], horizons).tolist(), strict=True)),
+        causality=causality(forecaster, run, folder, last // 2, horizons),
+        permutation=equivariance(forecaster, *where, symmetry="permutation", seed=seed),
+        sign=equivariance(forecaster, *where, symmetry="sign", seed=seed) if odd else None,
+        scale=scale(forecaster, *where),
+        drift=drift(forecaster, *where, seed=seed),
+    )
+
+
+def skills(
+    forecaster: Forecaster, runs: Sequence[Run], horizons: Sequence[int]
+) -> Float64[np.ndarray, " horizon"]:
+    """Skill at each horizon over all starts that have all horizons after them.
+
+    1 - sum |phi_{t+h} - forecast|^2 / sum |phi_{t+h} - phi_t|^2.
+    """
+    error, copy = np.zeros(len(horizons)), np.zeros(len(horizons))
+    for run in runs:
+        starts = np.arange(len(run) - max(horizons))
+        for part in np.array_split(starts, -(-len(starts) // 64)):
+            forecast = forecaster.forecast(run, part.tolist(), list(horizons))
+            rows = run.weights[part[0] : part[-1] + max(horizons) + 1].astype(np.float64)
+            now = part - part[0]
+            for place, h in enumerate(horizons):
+                error[place] += ((rows[now + h] - forecast[:, place]) ** 2).sum()
+                copy[place] += ((rows[now + h] - rows[now]) ** 2).sum()
+    return 1 - error / copy
+
+
+def causality(
+    forecaster: Forecaster, run: Run, folder: Path, start: int, horizons: Sequence[int]
+) -> bool:
+    """Whether the forecast is the same to the last bit with another future, and with none."""
+    weights = run.weights[:]
+    other = weights.copy()
+    rng = np.random.default_rng(0)
+    other[start + 1 :] += rng.normal(size=other[start + 1 :].shape).astype(np.float32)
+    forecasts = [
+        forecaster.forecast(run_like(run, rows, folder), [start], list(horizons))
+        for rows in (weights, other, weights[: start + 1])
+    ]
+    return all(np.array_equal(forecasts[0], later) for later in forecasts[1:])
+
+
+def equivariance(
+    forecaster: Forecaster,
+    run: Run,
+    folder: Path,
+    starts: Sequence[int],
+    horizons: Sequence[int],
+    *,
+    symmetry: str,
+    seed: int = 0,
+) -> float:
+    """Error of the forecast of a run with its hidden units altered, relative to the displacement.
+
+    Args:
+        forecaster: what is tested.
+        run: what is altered.
+        folder: the altered run is written there.
+        starts: where forecasts start.
+        horizons: how far to look.
+        symmetry: ``permutation`` of the units of each hidden layer, or ``sign``: a flip of the
+            weights into and out of some units, and of their biases.
+        seed: of the choice of units.
+    """
+    order, signs = random_symmetry(run.layout, symmetry, np.random.default_rng(seed))
+    weights = run.weights[:]
+    altered = run_like(run, weights[:, order] * signs, folder)
+    before = forecaster.forecast(run, list(starts), list(horizons))
+    after = forecaster.forecast(altered, list(starts), list(horizons))
+    expected = before[..., order] * signs
+    return _relative(after - expected, before - weights[list(starts)][:, None])
+
+
+def scale(
+    forecaster: Forecaster,
+    run: Run,
+    folder: Path,
+    starts: Sequence[int],
+    horizons: Sequence[int],
+    *,
+    factor: float = 2.0,
+) -> float:
+    """Error of the displacement when all steps are longer, relative to the displacement."""
+    weights = _on_grid(run.weights[:])
+    longer = weights[0] + factor * (weights - weights[0])
+    moved = [
+        forecaster.forecast(run_like(run, rows, folder), list(starts), list(horizons))
+        - rows[list(starts)][:, None]
+        for rows in (weights, longer)
+    ]
+    return _relative(moved[1] - factor * moved[0], moved[1])
+
+
+def drift(
+    forecaster: Forecaster,
+    run: Run,
+    folder: Path,
+    starts: Sequence[int],
+    horizons: Sequence[int],
+    *,
+    seed: int = 0,
+) -> float:
+    """Error of the forecast of a run on a straight line, relative to the true displacement."""
+    first = _on_grid(run.weights[0])
+    step = _on_grid(np.random.default_rng(seed).normal(size=first.shape) * 1e-3)
+    line = first + np.arange(max(starts) + 1)[:, None] * step
+    forecast = forecaster.forecast(run_like(run, line, folder), list(starts), list(horizons))
+    moved = np.asarray(horizons)[:, None] * step
+    return _relative(forecast - (line[list(starts)][:, None] + moved), moved)
+
+
+def random_walks(
+    run: Run, folder: Path, *, count: int = 4, length: int = 300, seed: int = 0
+) -> list[Run]:
+    """Runs whose steps are independent and normal: nothing in them can be forecast."""
+    walks = []
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        steps = 1e-3 * rng.normal(size=(length, run.layout.size))
+        steps[0] = run.weights[0]
+        walks.append(run_like(run, steps.cumsum(0), folder))
+    return walks
+
+
+def run_like(run: Run, weights: Float[np.ndarray, "time param"], folder: Path) -> Run:
+    """A run on disk with other weights, of any length.
+
+    Args:
+        run: its layout, cadence, counters and normalisers are copied; beyond its end the phases
+            go on and the rest stays as it was last.
+        weights: of the new run; float32 is stored.
+        folder: the new run is written there, named after its weights; if it is there, it is read.
+    """
+    stored = np.ascontiguousarray(weights, np.float32)
+    digest = hashlib.sha256(stored.tobytes()).hexdigest()[:16]
+    path = folder / f"{run.id[:100]}-{digest}.zarr"
+    if path.exists():
+        return open_run(path)
+    info = replace(
+        run.info,
+        run_id=path.stem,
+        diagnostics=(),
+        critic_layout=None,
+        optimizer_moments=False,
+        probe_observations=0,
+        block=128,
+    )
+    times, iterations, rates = run.num_timesteps, run.iteration, run.learning_rate
+    phases = _phases(run.phase, len(stored))
+    observations = _moments(run, "obs_norm") if info.obs_norm is not None else None
+    rewards = _moments(run, "ret_norm") if info.ret_norm else None
+    with RunWriter(path, info) as writer:
+        for t, row in enumerate(stored):
+            now = min(t, len(run) - 1)
+            writer.append(
+                row,
+                num_timesteps=int(times[now]) + t - now,
+                iteration=int(iterations[now]),
+                phase=int(phases[t]),
+                learning_rate=float(rates[now]),
+                obs_norm=None if observations is None else observations[now],
+                ret_norm=None if rewards is None else rewards[now],
+            )
+    return open_run(path)
+
+
+def random_symmetry(
+    layout: ParamLayout, symmetry: str, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, " param"], Float32[np.ndarray, " param"]]:
+    """A symmetry of a policy's hidden units: ``weights[..., order] * signs`` acts as before.
+
+    Axes with the same ``hidden_*`` label are altered together.
+    """
+    order = np.arange(layout.size)
+    signs = np.ones(layout.size, np.float32)
+    units: dict[str, np.ndarray] = {}
+    for param in layout.params:
+        places = order[param.slice].reshape(param.shape)
+        flips = signs[param.slice].reshape(param.shape)  # a view
+        for axis, (label, size) in enumerate(zip(param.axes, param.shape, strict=True)):
+            if not label.startswith("hidden_"):
+                continue
+            if label not in units:
+                flipped = rng.choice([-1.0, 1.0], size=size)
+                units[label] = rng.permutation(size) if symmetry == "permutation" else flipped
+            if symmetry == "permutation":
+                places = places.take(units[label], axis)
+            else:
+                flips *= np.expand_dims(units[label], [i for i in range(flips.ndim) if i != axis])
+        order[param.slice] = places.ravel()
+    return order, signs
+
+
+def _phases(known: Int[np.ndarray, " time"], length: int) -> Int[np.ndarray, " length"]:
+    """Phases of so many snapshots: the known ones, and then on and on."""
+    period = int(known.max()) + 1
+    if period < 1 or length <= len(known):
+        return np.resize(known, length)
+    beyond = (known[-1] + 1 + np.arange(length - len(known))) % period
+    return np.concatenate([known, beyond])
+
+
+def _moments(run: Run, group: str) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Statistics of a normaliser at each snapshot."""
+    mean, var, count = (run[f"{group}/{name}"][:] for name in ("mean", "var", "count"))
+    rows = zip(mean, var, count.tolist(), strict=True)
+    return [(np.asarray(m), np.asarray(v), n) for m, v, n in rows]
+
+
+def _on_grid(weights: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
+    return np.round(np.asarray(weights, np.float64) / GRID) * GRID
+
+
+def _relative(error: np.ndarray, moved: np.ndarray) -> float:
+    """Norm of an error over that of a displacement; no error is 0 even where nothing moves."""
+    if not error.any():
+        return 0.0
+    size = np.linalg.norm(np.asarray(moved, np.float64) * np.ones_like(error))
+    return float(np.linalg.norm(error) / max(size, np.finfo(float).tiny))
+
+
+__all__ = [
+    "GRID",
+    "NULL",
+    "TOLERANCE",
+    "Checks",
+    "Fit",
+    "causality",
+    "check",
+    "drift",
+    "equivariance",
+    "random_symmetry",
+    "random_walks",
+    "run_like",
+    "scale",
+    "skills",
+]
