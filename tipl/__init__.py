@@ -14,7 +14,8 @@ try:
 except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "tipl") from error
 
-from tipl.baselines import Persistence, Reconstruction
+from tipl.baselines import Persistence, Reconstruction, fit_ladder, save_ladder
+from tipl.checks import Checks, check
 from tipl.evaluation import EvaluateConfig, evaluate
 from tipl.forecast import TIPL, Forecaster
 from tipl.representation import TemporalSVD
@@ -23,14 +24,18 @@ from tipl.zoo import load
 
 __all__ = [
     "TIPL",
+    "Checks",
     "EvaluateConfig",
     "Forecaster",
     "Persistence",
     "Reconstruction",
     "TemporalSVD",
     "TrainConfig",
+    "check",
     "evaluate",
+    "fit_ladder",
     "load",
+    "save_ladder",
     "train",
 ]
 
