@@ -191,13 +191,26 @@ ALLOWED = {
         "weighttraj.threads",
     ],
     "tipl.checks": ["tipl.forecast", "door weighttraj"],
-    "tipl.train": [
+    "tipl.prepare": [
         "tipl.errors",
-        "tipl.forecast",
-        "tipl.models",
         "tipl.representation",
         "tipl.tokens",
         "door weighttraj",
+    ],
+    "tipl.distributed": ["tipl.errors"],
+    "tipl.state": ["tipl.errors"],
+    "tipl.progress": [],
+    "tipl.step": ["tipl.distributed", "tipl.errors", "tipl.models", "tipl.tokens"],
+    "tipl.train": [
+        "tipl.distributed",
+        "tipl.errors",
+        "tipl.forecast",
+        "tipl.models",
+        "tipl.prepare",
+        "tipl.progress",
+        "tipl.state",
+        "tipl.step",
+        "tipl.tokens",
     ],
     "tipl.report": ["tipl.errors", "tipl.report"],
     "tipl.evaluation": [
@@ -212,7 +225,7 @@ ALLOWED = {
         "weighttraj.threads",
     ],
     "tipl.zoo": ["tipl.baselines", "tipl.errors", "tipl.forecast"],
-    "tipl.cli": ["tipl", "weighttraj.errors"],
+    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors"],
     "tipl": ["tipl", "weighttraj.errors"],
 }
 

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+import weighttraj as wt
 from weighttraj.errors import WeightTrajError
 
 try:
     import tipl
     from tipl import report
+    from tipl.baselines import HORIZONS, TrainingConfig
+    from tipl.distributed import rank_here
     from tipl.evaluation import EvaluateConfig
     from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
@@ -33,15 +37,51 @@ _WIDE = 150
 @app.command(name="train")
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _train(config: TrainConfig) -> None:
-    """Train TIPL on the training runs of a data set, or go on where it stopped."""
+    """Train TIPL on the training runs of a data set, or go on where it stopped.
+
+    In several processes: ``torchrun --nproc-per-node 2 -m tipl.cli train`` with the same options.
+    """
+    signal.signal(signal.SIGTERM, _stop)
     tipl.train(config, console=console)
-    print(f"model in {config.out}")
+    if rank_here() == 0:
+        print(f"model in {config.out}")
+
+
+@app.command(name="fit")
+def _fit(
+    data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a data set: path or id")],
+    out: Annotated[Path, tyro.conf.arg(help="a folder; each baseline gets its own in it")],
+    seed: Annotated[int, tyro.conf.arg(help="of samples and of the small networks")] = 0,
+    horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="snapshots ahead")] = HORIZONS,
+    steps: Annotated[int, tyro.conf.arg(help="gradient steps of each small network")] = 2000,
+) -> None:
+    """Fit the ladder of baselines to the training runs of a data set; minutes on one core."""
+    dataset = wt.open_dataset(data)
+    validation = [run for run in dataset if run.split == "validation"]
+    with console.status("reading") as status:
+        ladder = tipl.fit_ladder(
+            dataset.split("train").runs,
+            validation,
+            horizons=horizons,
+            seed=seed,
+            progress=status.update,
+            training=TrainingConfig(steps=steps),
+        )
+    tipl.save_ladder(ladder, out)
+    print(f"{len(ladder)} baselines in {out}: {' '.join(f.name for f in ladder)}")
+
+
+def _stop(*_: object) -> NoReturn:
+    """`torchrun` and schedulers end a process with SIGTERM, some twice: to us that is Ctrl-C."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise KeyboardInterrupt
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Evaluate(EvaluateConfig):
     forecasters: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Folders of models, or names of forecasters that need no fit (``tipl zoo`` lists them)."""
+    """Folders of models and of fitted baselines, or names of baselines that need no fit:
+    ``ema-0.95``, say."""
     workers: int = 1
     """Processes, each with one thread; each takes a run at a time."""
 
@@ -92,13 +132,18 @@ def _table(results: dict[str, Any]) -> Table:
 def main() -> None:
     """Run the command line; errors of ours are printed without a traceback."""
     try:
+        _run()
+    except KeyboardInterrupt:  # while an error is printed, too
+        console.print("stopped; give the same command again to go on")
+        sys.exit(130)
+
+
+def _run() -> None:
+    try:
         app.cli(prog="tipl", description="Forecasts of policy weights: train and judge models.")
     except (WeightTrajError, FileNotFoundError) as error:
         console.print(f"[red]error:[/red] {escape(str(error))}")
         sys.exit(1)
-    except KeyboardInterrupt:
-        console.print("stopped; give the same command again to go on")
-        sys.exit(130)
 
 
 if __name__ == "__main__":

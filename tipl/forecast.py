@@ -23,7 +23,7 @@ from torch import Tensor
 
 from tipl.errors import ForecastError, ModelError
 from tipl.models.gpt import GPT, GPTConfig
-from tipl.representation import TemporalSVD
+from tipl.representation import embed
 from tipl.tokens import history
 from weighttraj import Run
 
@@ -110,12 +110,10 @@ class TIPL:
         """
         check_request(run, starts, horizons)
         self._check(run, max(starts) + max(horizons))
-        weights = run.weights[:]
-        svd = TemporalSVD.fit(weights, self.config.gpt.rank)
-        coefficients = svd.transform(weights)
-        rolled = self._roll_out(coefficients, np.asarray(starts), max(horizons))
+        embedded = embed(run, self.config.gpt.rank)
+        rolled = self._roll_out(embedded.coefficients, np.asarray(starts), max(horizons))
         chosen = rolled[:, np.asarray(horizons) - 1]
-        return svd.inverse_transform(chosen).astype(np.float32)
+        return embedded.svd.inverse_transform(chosen).astype(np.float32)
 
     @torch.no_grad()
     def _roll_out(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tipl.errors import TrainError
-from tipl.representation import TemporalSVD
+from tipl.representation import Embedded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +29,26 @@ class Batch:
     weights: Tensor
     """float32 (batch, rank): squared singular values over P. They turn squared errors of
     coefficients into the mean squared error of policy weights."""
+    rows: int
+    """Unpadded rows of the whole batch, also where this is a share of it."""
 
-    def to(self, device: str) -> Batch:
+    def to(self, device: str | torch.device) -> Batch:
         """The same batch on another device."""
-        return replace(self, **{name: tensor.to(device) for name, tensor in vars(self).items()})
+        return self._each(lambda tensor: tensor.to(device))
+
+    def share(self, windows: slice) -> Batch:
+        """Some windows of the batch. Errors of shares that make up the batch add up to its own."""
+        return self._each(lambda tensor: tensor[windows])
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        return Batch(
+            tokens=change(self.tokens),
+            timesteps=change(self.timesteps),
+            mask=change(self.mask),
+            targets=change(self.targets),
+            weights=change(self.weights),
+            rows=self.rows,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,16 +61,21 @@ class TokenRun:
     """Squared singular values over P."""
 
     @classmethod
-    def of(cls, svd: TemporalSVD, weights: Float[np.ndarray, "time param"]) -> TokenRun:
-        """Coefficients of a trajectory in its basis."""
+    def of(cls, embedded: Embedded) -> TokenRun:
+        """A run in the basis of its whole trajectory."""
+        svd = embedded.svd
         return cls(
-            coefficients=svd.transform(weights).astype(np.float32),
-            weights=(svd.singular_values**2 / weights.shape[1]).astype(np.float32),
+            coefficients=embedded.coefficients.astype(np.float32),
+            weights=(svd.singular_values**2 / svd.components.shape[1]).astype(np.float32),
         )
 
 
 class TokenSampler:
     """Draws random windows; batch n is a function of (seed, n) alone.
+
+    Ours, where the paper is silent: windows end at each snapshot that has a successor with equal
+    probability, with replacement; the first ones of a run are padded on the left, as Decision
+    Transformer's are.
 
     Args:
         runs: runs in coefficients.
@@ -98,15 +119,36 @@ class TokenSampler:
         """Batch number n."""
         rng = np.random.default_rng([self.seed, n])
         pick = rng.integers(len(self._t), size=self.batch_size)
-        run, t = self._run[pick], self._t[pick]
+        return self._windows(self._run[pick], self._t[pick])
+
+    def tiles(self, most: int) -> list[Batch]:
+        """Windows side by side that predict each snapshot of each run once, phi_0 left out.
+
+        Args:
+            most: no more windows than this; they are evenly chosen if there are.
+
+        Returns:
+            shares of one large batch, each of at most ``batch_size`` windows.
+        """
+        ends = [np.arange(n - 2, -1, -self.window) for n in self._lengths]
+        run, t = np.repeat(np.arange(len(ends)), [len(e) for e in ends]), np.concatenate(ends)
+        pick = np.linspace(0, len(t) - 1, min(len(t), most)).round().astype(int)
+        everything = self._windows(run[pick], t[pick])
+        starts = range(0, len(pick), self.batch_size)
+        return [everything.share(slice(start, start + self.batch_size)) for start in starts]
+
+    def _windows(self, run: Int[np.ndarray, " batch"], t: Int[np.ndarray, " batch"]) -> Batch:
+        """Windows of these runs that end at these snapshots."""
         steps = t[:, None] + np.arange(-self.window + 1, 1)
-        rows = self._first[run][:, None] + steps
+        first = (self._first[run] + t - self.window + 1)[:, None]
+        rows = torch.from_numpy(self._rows[first + np.arange(self.window + 1)])
         return Batch(
-            tokens=torch.from_numpy(self._rows[rows]),
+            tokens=rows[:, :-1],
             timesteps=torch.from_numpy(np.maximum(steps, 0)),
             mask=torch.from_numpy(steps >= 0),
-            targets=torch.from_numpy(self._rows[rows + 1]),
+            targets=rows[:, 1:],
             weights=torch.from_numpy(self._weights[run]),
+            rows=int((steps >= 0).sum()),
         )
 
 

@@ -209,12 +209,13 @@ def processes(iterations: int, turns: int) -> dict[str, Any]:
                 collect(recipe, Path(folder) / "dataset", workers=workers)
                 seconds.append(round(time.monotonic() - start, 1))
                 print(f"{workers} processes: {seconds[-1]} s", flush=True)
-    ratios = [one / two for one, two in zip(wall[1], wall[2], strict=True)]
+    ratios = [round(one / two, 2) for one, two in zip(wall[1], wall[2], strict=True)]
     return {
         "case": "InvertedPendulum-v4, 8x8",
         "runs": 32,
         "iterations": iterations,
         "wall_s": {str(workers): seconds for workers, seconds in wall.items()},
+        "ratios": ratios,
         "times_faster": round(statistics.median(ratios), 2),
     }
 

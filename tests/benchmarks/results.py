@@ -51,6 +51,8 @@ def render(results: dict[str, Any]) -> str:
     ]
     if "load" in results:
         lines.append(_load(results["load"]))
+    if "svd" in results:
+        lines.append(_svd(results["svd"]))
     if "callback" in results:
         callback = results["callback"]
         lines.append(
@@ -69,8 +71,11 @@ def render(results: dict[str, Any]) -> str:
         row = results["processes"]
         lines.append(
             f"{row['runs']} runs of {row['iterations']} iterations, {row['case']}: two processes "
-            f"are done {row['times_faster']} times as fast as one, start-up included."
+            f"are done {row['times_faster']} times as fast as one, start-up included (turns on a "
+            f"noisy machine: {', '.join(map(str, sorted(row['ratios'])))})."
         )
+    if "tipl_train" in results:
+        lines.append(_training(results["tipl_train"]))
     if "learning" in results:
         lines += _learning(results["learning"])
     if "recipes" in results:
@@ -119,55 +124,88 @@ def _returns(row: dict[str, Any]) -> str:
     )
 
 
+def _training(training: dict[str, Any]) -> str:
+    row = training["threads_1"]
+    beside = (
+        f"{row['over_transformers']:.2f} of the time of the same GPT-2 from `transformers`, "
+        if "over_transformers" in row
+        else ""
+    )
+    return (
+        f"A gradient step of TIPL on one CPU thread, 64 windows of 20, {training['gflop']:.1f} "
+        f"GFLOP: {beside}{row['gflop_per_s']:.0f} GFLOP/s where a matrix product alone reaches "
+        f"{row['gflop_per_s_of_product']:.0f}; 100,000 batches take {row['hours_of_100k']:.1f} "
+        "hours."
+    )
+
+
 def _learning(learning: dict[str, Any]) -> list[str]:
     """Two samples of runs side by side, what tests say of them, and the runs of the same seeds."""
     seeds = {who: "{} to {}".format(*ends) for who, ends in learning["seeds"].items()}
     units = "x".join(map(str, learning["units"]))
-    lines = [
-        "",
+    samples = [
         f"| {learning['env']} {units}, {learning['timesteps']:,} steps | "
         + " | ".join(f"{who}, seeds {numbers}" for who, numbers in seeds.items())
-        + " | difference | p: means, distributions | control: difference | p | same seeds: "
-        "difference | p |",
-        "|---|" + "---:|" * (len(seeds) + 6),
+        + " | difference | p: means, distributions | control: difference | p |",
+        "|---|" + "---:|" * (len(seeds) + 4),
     ]
     for name, row in learning["samples"].items():
-        control, pairs = learning["control"][name], learning["same_seeds"][name]
         ranges = zip(row["iqm"], row["intervals"], strict=True)
         cells = [f"{iqm:,.0f} ({low:,.0f} to {high:,.0f})" for iqm, (low, high) in ranges]
-        cells += [
-            f"{row['difference_percent']:+.1f} % ± {row['half_width_percent']:.1f} %",
-            f"{row['p']['means']:.2g}, {row['p']['distributions']:.2g}",
-            f"{control['difference_percent']:+.1f} %",
-            f"{control['p']['means']:.2g}, {control['p']['distributions']:.2g}",
-            f"{pairs['difference_percent']:+.1f} %",
-            f"{pairs['p']:.2g}",
-        ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        for pair in (row, learning["control"][name]):
+            cells += [
+                f"{pair['difference_percent']:+.1f} % ± {pair['half_width_percent']:.1f} %",
+                f"{pair['p']['means']:.2g}, {pair['p']['distributions']:.2g}",
+            ]
+        samples.append(f"| {name} | " + " | ".join(cells) + " |")
+    pairs = [
+        f"| population less SB3, seeds {seeds['SB3']} | difference | p | apart: median | most "
+        "| equal runs |",
+        "|---|" + "---:|" * 5,
+    ]
+    pairs += [
+        f"| {name} | {pair['difference_percent']:+.1f} % | {pair['p']:.2g} "
+        f"| {pair['median_absolute']:,.0f} | {pair['max_absolute']:,.0f} | {pair['equal']} |"
+        for name, pair in learning["same_seeds"].items()
+    ]
     never = " and ".join(
-        f"{threshold} in {sb3} and {population} runs"
+        f"{threshold} by {sb3} and {population} runs"
         for threshold, sb3, population in zip(
             learning["thresholds"], *(learning["never"][who] for who in seeds), strict=True
         )
     )
     overlaps = sum(row["intervals_overlap"] for row in learning["samples"].values())
-    apart = "; ".join(
-        f"{name}: {pair['median_absolute']:,.3g} and {pair['max_absolute']:,.3g}"
-        for name, pair in learning["same_seeds"].items()
-    )
     return [
-        *lines,
         "",
-        f"Does a population learn as SB3 does? Training returns, means of {learning['episodes']} "
-        "episodes at the end of each rollout; a run that never reaches a threshold counts as the "
-        f"whole length ({never}). Interquartile means over runs with 95 % bootstrap intervals, of "
-        f"which {overlaps} of {len(learning['samples'])} overlap. Differences are of means; after "
-        "± stands the half width of the 95 % interval: a smaller difference does not show. p by "
-        "permutation, of the means and of Kolmogorov-Smirnov's statistic. Control: the population "
-        "on SB3's seeds against the population on its own, set apart by the seeds alone. "
-        "Same seeds: the population against SB3 run by run, p by flipping signs; the two are apart "
-        f"by (median and most) {apart}.",
+        "Does a population learn as SB3 does? Training returns, means of "
+        f"{learning['episodes']} episodes at the end of each rollout:",
+        "",
+        *samples,
+        "",
+        "Interquartile means over runs with 95 % bootstrap intervals; "
+        f"{overlaps} of {len(learning['samples'])} pairs of intervals overlap. A run that never "
+        f"reaches a threshold would count as the whole length; never reached: {never}. Differences "
+        "are of means, with the half width of their 95 % interval: smaller ones seldom show. "
+        "p by permutation, of the means and of Kolmogorov-Smirnov's statistic. Control: the "
+        "population on SB3's seeds against its own seeds, so that only the seeds differ.",
+        "The same seeds run by run, p by flipping signs:",
+        "",
+        *pairs,
     ]
+
+
+def _svd(svd: dict[str, Any]) -> str:
+    apart = ", ".join(f"{name}: {row['worst_of_first']:.1g}" for name, row in svd["apart"].items())
+    return (
+        "Temporal SVD of rank {} of {:,} snapshots x {:,} parameters, ".format(
+            svd["rank"], *svd["shape"]
+        )
+        + f"read {svd['passes']:.0f} times from the disk: {svd['cpu_s']:.0f} CPU seconds, of which "
+        f"{svd['decode_cpu_s']:.0f} decode, {svd['times_faster']:.0f} times fewer than "
+        f"`numpy.linalg.svd` (extrapolated from {svd['numpy_rows']:,} snapshots, "
+        f"{svd['numpy_cpu_s']:.0f} s), in {svd['peak_mb']:.0f} MB of memory. The first "
+        f"{svd['compared']} singular values are right within (relative) {apart}."
+    )
 
 
 def _load(load: dict[str, Any]) -> str:

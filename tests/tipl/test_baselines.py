@@ -28,7 +28,6 @@ from tipl.baselines import (
     TrainingConfig,
     by_name,
     fit_ladder,
-    load,
     names,
     save_ladder,
 )
@@ -38,6 +37,7 @@ from tipl.baselines.trajectory import Trajectory, thinned
 from tipl.checks import run_like, skills
 from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.forecast import Forecaster
+from tipl.zoo import load
 from weighttraj.errors import DamageError
 
 BRIEFLY = TrainingConfig(steps=30, batch_size=512)
@@ -470,13 +470,17 @@ def test_arrays_that_do_not_fit(ladder: list[Forecaster], tmp_path: Path) -> Non
 
 
 def test_folders_that_hold_nothing_of_ours(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ForecastError, match="there is no such forecaster"):
         load(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        DMD.load(tmp_path)
     for text in ("{", "[]", '{"kind": "oracle"}', '{"kind": ["dmd"]}', "{}"):
         (tmp_path / "config.json").write_text(text)
-        for wrong in (load, Persistence.load, Extrapolation.load, DMD.load, Reconstruction.load):
+        with pytest.raises(ModelError, match="no forecaster"):
+            load(tmp_path)
+        for kind in (Persistence, Extrapolation, DMD, Reconstruction):
             with pytest.raises(ModelError, match="cannot be loaded"):
-                wrong(tmp_path)
+                kind.load(tmp_path)
     (tmp_path / "config.json").write_text('{"kind": "extrapolation"}')
     with pytest.raises(ModelError, match="velocity"):
         load(tmp_path)

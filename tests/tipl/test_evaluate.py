@@ -12,7 +12,7 @@ import torch
 
 import weighttraj as wt
 from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evaluate, load, train
-from tipl.errors import EvaluateError, ModelError
+from tipl.errors import EvaluateError
 from tipl.evaluation import measure
 from tipl.evaluation.parts import Parts
 from tipl.evaluation.starts import at_boundary, learning_phase, starts_of
@@ -349,17 +349,3 @@ def test_runs_without_returns_are_refused(small_dataset: Path, tmp_path: Path) -
 def test_equal_names_are_refused(model: Path, config: EvaluateConfig) -> None:
     with pytest.raises(EvaluateError, match="the same name"):
         evaluate([load(model), load(model)], config)
-
-
-def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no model at nothing"):
-        load("nothing")
-    (tmp_path / "config.json").write_text('{"kind": "crystal ball"}')
-    with pytest.raises(ModelError, match="crystal ball"):
-        load(tmp_path)
-
-
-def test_baselines_are_saved_and_loaded(tmp_path: Path) -> None:
-    for forecaster in (Persistence(), Reconstruction(7)):
-        forecaster.save(tmp_path / forecaster.name)
-        assert load(tmp_path / forecaster.name) == forecaster

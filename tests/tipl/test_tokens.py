@@ -6,6 +6,7 @@ import torch
 
 from tipl import TemporalSVD
 from tipl.errors import TrainError
+from tipl.representation import Embedded
 from tipl.tokens import TokenRun, TokenSampler, history
 from tipl.train import weight_prediction_error
 
@@ -29,6 +30,29 @@ def test_windows_pads_and_targets() -> None:
     last = {(int(o), int(t)) for o, t in zip(offset, batch.timesteps[:, -1], strict=True)}
     assert last <= {(100, t) for t in range(8)} | {(1000, t) for t in range(29)}
     assert len(last) > 30
+
+
+def test_shares_add_up_to_the_batch() -> None:
+    sampler = TokenSampler([run(9, 100), run(30, 1000)], window=5, batch_size=11, seed=0)
+    batch = sampler.batch(0)
+    predicted = torch.randn(batch.targets.shape)
+    shares = [slice(0, 3), slice(3, 4), slice(4, 11)]
+    parts = [weight_prediction_error(predicted[s], batch.share(s)) for s in shares]
+    torch.testing.assert_close(sum(parts), weight_prediction_error(predicted, batch))
+    assert batch.share(shares[0]).tokens.shape == (3, 5, 3)
+    assert {batch.share(s).rows for s in shares} == {int(batch.mask.sum())}
+
+
+def test_tiles_predict_every_snapshot_once() -> None:
+    sampler = TokenSampler([run(9, 100), run(32, 1000)], window=5, batch_size=3, seed=0)
+    tiles = sampler.tiles(100)
+    assert [len(tile.tokens) for tile in tiles] == [3, 3, 3]
+    seen = torch.cat([tile.targets[tile.mask][:, 0] for tile in tiles])
+    assert sorted(seen.tolist()) == [*range(101, 109), *range(1001, 1032)]
+    assert {tile.rows for tile in tiles} == {39}
+    few = sampler.tiles(4)
+    assert sum(len(tile.tokens) for tile in few) == 4
+    assert {int(tile.weights[0, 0]) for tile in few} == {100, 1000}  # of both runs
 
 
 def test_a_batch_is_a_function_of_seed_and_number() -> None:
@@ -59,7 +83,8 @@ def test_the_loss_is_the_mean_squared_error_of_the_weights() -> None:
     rng = np.random.default_rng(0)
     weights = rng.normal(size=(40, 17)).astype(np.float32)
     svd = TemporalSVD.fit(weights, rank=6)
-    sampler = TokenSampler([TokenRun.of(svd, weights)], window=5, batch_size=16, seed=0)
+    embedded = Embedded(svd=svd, coefficients=svd.transform(weights))
+    sampler = TokenSampler([TokenRun.of(embedded)], window=5, batch_size=16, seed=0)
     batch = sampler.batch(0)
     predicted = batch.targets + torch.randn(batch.targets.shape) * 0.1
     truth, guess = (

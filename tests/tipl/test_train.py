@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import io
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 import weighttraj as wt
 from tipl import TIPL, Persistence, Reconstruction, TemporalSVD, TrainConfig, train
@@ -33,11 +36,62 @@ def config(small_dataset: Path, tmp_path: Path) -> TrainConfig:
     )
 
 
+def log(config: TrainConfig) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
+
+
 def test_training_lowers_the_loss_and_writes_a_log(config: TrainConfig) -> None:
     train(replace(config, n_batches=300, learning_rate=1e-2, save_every=100))
-    lines = [json.loads(s) for s in (config.out / "log.jsonl").read_text().splitlines()]
+    lines = log(config)
     assert [line["batch"] for line in lines] == [100, 200, 300]
     assert lines[-1]["wpe"] < 0.2 * lines[0]["wpe"]
+    assert all(line["batches_per_s"] > 0 for line in lines)
+    assert "validation_wpe" not in lines[0]  # the data set has no such split
+
+
+def test_validation_is_one_step_ahead_without_dropout(config: TrainConfig, tmp_path: Path) -> None:
+    data = tmp_path / "dataset"
+    shutil.copytree(config.data, data)
+    info = read_dataset_info(data)
+    runs = [replace(run, split="validation") if run.seed == 2 else run for run in info.runs]
+    write_dataset_info(data, replace(info, runs=tuple(runs)))
+    # With a window of one, each forecast is from one token, as in training. 200 batches between
+    # lines are enough for an error on all 48 windows.
+    settings = replace(config, data=data, block_size=1, dropout=0.5, save_every=200, n_batches=200)
+    model, run = train(settings), wt.open(data).split("validation").runs[0]
+    (line,) = log(config)
+    weights = run.weights[:]
+    svd = TemporalSVD.fit(weights, 8)
+    truth = svd.inverse_transform(svd.transform(weights))[1:]
+    forecasts = model.forecast(run, range(48), [1])[:, 0]
+    assert line["validation_wpe"] == pytest.approx(np.mean((truth - forecasts) ** 2), rel=1e-4)
+    # It leaves the parameters alone.
+    parameters = train(replace(settings, data=config.data, out=tmp_path / "plain")).model
+    for name, tensor in parameters.state_dict().items():
+        assert torch.equal(tensor, model.model.state_dict()[name]), name
+
+
+def test_what_was_logged_and_not_saved_is_logged_once(config: TrainConfig) -> None:
+    train(replace(config, n_batches=3))
+    with (config.out / "log.jsonl").open("a") as file:  # a process died before it saved
+        file.write(json.dumps({"batch": 6, "wpe": 1e9}) + "\n")
+    train(config)
+    assert [line["batch"] for line in log(config)] == [3, 6]
+    assert log(config)[-1]["wpe"] < 1e9
+
+
+def test_a_bar_shows_speed_and_error(config: TrainConfig) -> None:
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    train(config, console=console)
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "6/6" in shown
+    assert re.search(r"\d batches/s, WPE \d", shown)
+
+
+def test_the_number_of_threads_is_put_back(config: TrainConfig) -> None:
+    torch.set_num_threads(2)
+    train(config)
+    assert torch.get_num_threads() == 2
 
 
 def test_an_interrupted_training_ends_as_an_undisturbed_one(
@@ -127,8 +181,12 @@ def test_a_longer_training_is_not_passed_off_as_a_shorter_one(config: TrainConfi
     ("change", "message"),
     [
         ({"n_head": 3}, "n_embd a multiple of n_head"),
+        ({"save_every": 0}, "sizes of at least 1(.|\n)*save_every 0"),
+        ({"dropout": 1.0}, "dropout from 0 to below 1"),
         ({"block_size": 50}, "block_size at most 49"),
+        ({"rank": 50}, "run seed0000 has no such coefficients"),
         ({"device": "xpu:9"}, "choose another --device"),
+        ({"device": "nonsense"}, "choose another --device"),
     ],
 )
 def test_impossible_settings_leave_no_folder(

@@ -19,13 +19,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-import msgspec
-
 from tipl.baselines.endpoints import EndPoints
-from tipl.baselines.files import CONFIG, broken
 from tipl.baselines.floor import Reconstruction
 from tipl.baselines.horizons import HORIZONS
 from tipl.baselines.ladder import by_name, fit_ladder, names, save_ladder
@@ -50,22 +44,6 @@ KINDS: dict[str, type[Forecaster]] = {
 """The class of each ``kind`` that config.json of a saved baseline may name."""
 
 
-def load(path: str | Path) -> Forecaster:
-    """A saved baseline, whichever it is.
-
-    Raises:
-        FileNotFoundError: there is no forecaster in the folder.
-        ModelError: it is no baseline, or damaged.
-    """
-    text = (Path(path) / CONFIG).read_bytes()
-    try:
-        kind = msgspec.json.decode(text, type=dict[str, Any])["kind"]
-        found = KINDS[kind]
-    except (ValueError, KeyError, TypeError) as error:
-        raise broken(path, f"{error!r}; kinds are {sorted(KINDS)}") from error
-    return found.load(path)
-
-
 __all__ = [
     "DMD",
     "HORIZONS",
@@ -85,7 +63,6 @@ __all__ = [
     "TrainingConfig",
     "by_name",
     "fit_ladder",
-    "load",
     "names",
     "save_ladder",
 ]

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from tipl.baselines.files import read_config, write
 from tipl.forecast import check_request
-from tipl.representation import TemporalSVD
+from tipl.representation import embed
 from weighttraj import Run
 
 
@@ -38,10 +38,10 @@ class Reconstruction:
     ) -> Float32[np.ndarray, "start horizon param"]:
         """phi_{t+h} projected to the first d directions of the run."""
         check_request(run, starts, horizons)
-        weights = run.weights[:]
-        svd = TemporalSVD.fit(weights, self.rank)
+        embedded = embed(run, self.rank)
         later = np.asarray(starts)[:, None] + np.asarray(horizons)
-        return svd.inverse_transform(svd.transform(weights[later])).astype(np.float32)
+        back = embedded.svd.inverse_transform(embedded.coefficients[later])
+        return back.astype(np.float32)
 
     def save(self, path: str | Path) -> None:
         """Write config.json."""

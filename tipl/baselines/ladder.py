@@ -46,10 +46,10 @@ def by_name(name: str) -> Forecaster:
         if forecaster.name == name:
             return forecaster
     raise ForecastError(
-        "there is no forecaster of this name that needs no fit",
-        expected=", ".join(names()),
+        "there is no such forecaster",
+        expected=f"a folder with config.json, or one of {', '.join(names())}",
         got=name,
-        do="choose one of those, or name the folder of a fitted one",
+        do="name the folder that `tipl train` or `tipl fit` made",
     )
 
 

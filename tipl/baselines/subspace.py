@@ -90,9 +90,8 @@ class DMD:
     Ours: steps instead of weights, so that a straight line is a fixed point and the origin doesn't
     matter; 50 steps, rank 2. On some validation runs of InvertedPendulum that loses least (skill
     0.00, -0.01, -0.04 at h = 1, 5, 10; rank 5: -0.06, -0.05, -0.14; weights instead of steps, rank
-    5: -0.13, -0.26, -0.50). Nothing is fitted to other runs; the null test passes all the same,
-    as the
-    steps of a random walk in 122 dimensions are nearly orthogonal and A is nearly 0.
+    5: -0.13, -0.26, -0.50). Nothing is fitted to other runs; the null test passes all the same, as
+    the steps of a random walk in 122 dimensions are nearly orthogonal and A is nearly 0.
     """
 
     window: int = 50

@@ -161,7 +161,7 @@ def renewal(t: int) -> int:
     These are the snapshots 1, 2, ..., 20 and then each that makes the past a tenth longer.
 
     >>> [renewal(t) for t in (0, 7, 21, 22, 25, 1000)]
-    [0, 7, 20, 22, 24, 968]
+    [0, 7, 20, 22, 24, 972]
     """
     now = 0
     while (following := max(now + 1, now * 11 // 10)) <= t:

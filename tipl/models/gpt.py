@@ -9,12 +9,12 @@ token of t + 1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn import functional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +32,15 @@ class GPTConfig:
     n_head: int = 1
     """Attention heads."""
     n_embd: int = 128
-    """Width."""
+    """Width of the stream."""
     dropout: float = 0.1
     """Dropout of embeddings, attention and residual branches."""
+
+    @property
+    def dropped(self) -> tuple[int, ...]:
+        """Activations of one window that dropout sees: embedding, then three sites a block."""
+        stream, attention = self.block_size * self.n_embd, self.n_head * self.block_size**2
+        return (stream, *(attention, stream, stream) * self.n_layer)
 
 
 class GPT(nn.Module):
@@ -52,7 +58,6 @@ class GPT(nn.Module):
         self.embed_token = nn.Linear(config.rank, config.n_embd)
         self.embed_timestep = nn.Embedding(config.max_timestep, config.n_embd)
         self.embed_norm = nn.LayerNorm(config.n_embd)
-        self.dropout = nn.Dropout(config.dropout)
         self.blocks = nn.ModuleList([Block(config) for _ in range(config.n_layer)])
         self.final_norm = nn.LayerNorm(config.n_embd)
         self.head = nn.Linear(config.n_embd, config.rank)
@@ -63,19 +68,25 @@ class GPT(nn.Module):
         tokens: Float[Tensor, "batch window rank"],
         timesteps: Int[Tensor, "batch window"],
         mask: Bool[Tensor, "batch window"],
+        keep: Sequence[Float[Tensor, "batch _"]] | None = None,
     ) -> Float[Tensor, "batch window rank"]:
-        """Predicted next tokens. Rows where ``mask`` is False are padding on the left."""
+        """Predicted next tokens. Rows where ``mask`` is False are padding on the left.
+
+        Args:
+            tokens: coefficients of consecutive snapshots.
+            timesteps: index of each.
+            mask: False in padding.
+            keep: factors of dropout, a tensor a site of ``GPTConfig.dropped``; None drops nothing.
+        """
+        at_input, *at_blocks = keep or (None,) * len(self.config.dropped)
         x = self.embed_token((tokens - self.input_mean) / self.input_std)
         x = self.embed_norm(x + self.embed_timestep(timesteps))
-        x = self.dropout(x)  # (batch, window, n_embd)
-        window = tokens.shape[1]
-        causal = torch.ones(window, window, dtype=torch.bool, device=tokens.device).tril()
-        # A padding row attends to itself: a row with nothing to attend to would be NaN.
-        itself = torch.eye(window, dtype=torch.bool, device=tokens.device)
-        visible = (causal & mask[:, None, :]) | itself  # (batch, window, window)
-        for block in self.blocks:
-            x = block(x, visible[:, None])
-        predicted: Tensor = self.head(self.final_norm(x))
+        hidden = _hidden(mask, self.config.n_head)
+        # In the blocks all rows are one matrix: products take it as it is, forth and back.
+        x = _drop(x.flatten(0, 1), at_input)  # (batch * window, n_embd)
+        for i, block in enumerate(self.blocks):
+            x = block(x, hidden, *at_blocks[3 * i : 3 * i + 3])
+        predicted: Tensor = self.head(self.final_norm(x)).view(tokens.shape)
         return predicted
 
 
@@ -84,33 +95,76 @@ class Block(nn.Module):
 
     def __init__(self, config: GPTConfig) -> None:
         super().__init__()
-        self.n_head, self.p = config.n_head, config.dropout
+        self.n_head = config.n_head
         self.norm_1 = nn.LayerNorm(config.n_embd)
         self.qkv = nn.Linear(config.n_embd, 3 * config.n_embd)
         self.proj = nn.Linear(config.n_embd, config.n_embd)
         self.norm_2 = nn.LayerNorm(config.n_embd)
         self.mlp = nn.Sequential(
             nn.Linear(config.n_embd, 4 * config.n_embd),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Linear(4 * config.n_embd, config.n_embd),
-            nn.Dropout(config.dropout),
         )
-        self.dropout = nn.Dropout(config.dropout)
 
     def forward(
         self,
-        x: Float[Tensor, "batch window n_embd"],
-        visible: Bool[Tensor, "batch 1 window window"],
-    ) -> Float[Tensor, "batch window n_embd"]:
-        """The stream after this block."""
-        batch, window, width = x.shape
-        heads = self.qkv(self.norm_1(x)).view(batch, window, 3, self.n_head, -1)
-        q, k, v = heads.permute(2, 0, 3, 1, 4)  # each (batch, n_head, window, n_embd / n_head)
-        p = self.p if self.training else 0.0
-        mixed = functional.scaled_dot_product_attention(q, k, v, attn_mask=visible, dropout_p=p)
-        mixed = mixed.transpose(1, 2).reshape(batch, window, width)
-        x = x + self.dropout(self.proj(mixed))
-        return x + self.mlp(self.norm_2(x))  # type: ignore[no-any-return]
+        x: Float[Tensor, "row n_embd"],
+        hidden: Float[Tensor, "batch_head window window"],
+        keep_attention: Float[Tensor, "batch attention"] | None,
+        keep_mixed: Float[Tensor, "batch stream"] | None,
+        keep_mlp: Float[Tensor, "batch stream"] | None,
+    ) -> Float[Tensor, "row n_embd"]:
+        """The stream after this block.
+
+        Args:
+            x: the stream, all windows one below the other.
+            hidden: 0 where a token may attend, minus infinity elsewhere.
+            keep_attention: factors of dropout on the attention, or None.
+            keep_mixed: the same on what attention adds.
+            keep_mlp: the same on what the MLP adds.
+        """
+        mixed = self.proj(self._attend(self.norm_1(x), hidden, keep_attention))
+        x = x + _drop(mixed, keep_mixed)
+        return x + _drop(self.mlp(self.norm_2(x)), keep_mlp)
+
+    def _attend(
+        self,
+        x: Float[Tensor, "row n_embd"],
+        hidden: Float[Tensor, "batch_head window window"],
+        keep: Float[Tensor, "batch attention"] | None,
+    ) -> Float[Tensor, "row n_embd"]:
+        # In a window as short as ours, plain products beat scaled_dot_product_attention.
+        window = hidden.shape[1]
+        q, k, v = (self._heads(part, window) for part in self.qkv(x).chunk(3, dim=1))
+        scale = q.shape[2] ** -0.5
+        scores = torch.add(hidden, torch.bmm(q, k.transpose(1, 2)), alpha=scale)
+        attention = _drop(scores.softmax(-1), keep)
+        mixed = torch.bmm(attention, v)  # (batch * n_head, window, n_embd / n_head)
+        mixed = mixed.view(-1, self.n_head, *mixed.shape[1:]).transpose(1, 2)
+        return mixed.reshape(x.shape)
+
+    def _heads(
+        self, x: Float[Tensor, "row n_embd"], window: int
+    ) -> Float[Tensor, "batch_head window width"]:
+        parts = x.view(x.shape[0] // window, window, self.n_head, -1)
+        return parts.transpose(1, 2).flatten(0, 1)
+
+
+def _hidden(
+    mask: Bool[Tensor, "batch window"], n_head: int
+) -> Float[Tensor, "batch_head window window"]:
+    """Minus infinity where a token must not look: at what comes later, and at padding."""
+    window = mask.shape[1]
+    causal = torch.ones(window, window, dtype=torch.bool, device=mask.device).tril()
+    # A padding row attends to itself: a row with nothing to attend to would be NaN.
+    itself = torch.eye(window, dtype=torch.bool, device=mask.device)
+    visible = (causal & mask[:, None, :]) | itself  # (batch, window, window)
+    hidden = torch.zeros(visible.shape, device=mask.device).masked_fill_(~visible, -torch.inf)
+    return hidden.repeat_interleave(n_head, dim=0)
+
+
+def _drop(x: Float[Tensor, "*any"], keep: Float[Tensor, "batch each"] | None) -> Tensor:
+    return x if keep is None else x * keep.view(x.shape)
 
 
 def _init_gpt2(module: nn.Module) -> None:

@@ -1,0 +1,66 @@
+"""The bar that a training shows."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+
+class TrainingBar:
+    """Batches done, batches a second and WPE; draws nothing on a quiet console.
+
+    Args:
+        total: batches of the whole training.
+        start: batches done before.
+        console: where to draw.
+    """
+
+    def __init__(self, total: int, start: int, console: Console) -> None:
+        # Twice a second: drawing takes time from the training.
+        self._progress = Progress(
+            TextColumn("training"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[speed]:.3g} batches/s, WPE {task.fields[wpe]:.3g}"),
+            TimeRemainingColumn(),
+            console=console,
+            refresh_per_second=2,
+            disable=console.quiet,
+        )
+        self._task = self._progress.add_task(
+            "training", total=total, completed=start, speed=0.0, wpe=float("nan")
+        )
+        self._since, self._count = time.perf_counter(), 0
+
+    def advance(self, wpe: float) -> None:
+        """One more batch.
+
+        Args:
+            wpe: mean since the line of the log before.
+        """
+        self._count += 1
+        self._progress.update(self._task, advance=1, speed=self.speed, wpe=wpe)
+
+    @property
+    def speed(self) -> float:
+        """Batches a second since the line of the log before."""
+        return self._count / max(time.perf_counter() - self._since, 1e-9)
+
+    def restart(self) -> None:
+        """A line of the log was written."""
+        self._since, self._count = time.perf_counter(), 0
+
+    def __enter__(self) -> TrainingBar:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._progress.stop()

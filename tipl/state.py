@@ -1,0 +1,116 @@
+"""The folder of a training: its settings, its log, and a state from which it goes on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from tipl.errors import TrainError
+
+
+def keep_settings(out: Path, settings: dict[str, Any], may_differ: Collection[str]) -> None:
+    """Keep the settings beside the model, and refuse to go on with others.
+
+    Args:
+        out: folder of the model; made if it is not there.
+        settings: what JSON can hold.
+        may_differ: settings that can change from one start to the next.
+
+    Raises:
+        TrainError: the folder holds a training with other settings.
+    """
+    file = out / "train.json"
+    if file.exists():
+        old = json.loads(file.read_text())
+        other = {k: v for k, v in settings.items() if old.get(k) != v and k not in may_differ}
+        if other:
+            raise TrainError(
+                "the folder holds a training with other settings or data",
+                expected={k: old.get(k) for k in other},
+                got=other,
+                where=out,
+                do="choose another --out, or delete the folder",
+            )
+    out.mkdir(parents=True, exist_ok=True)
+    draft = out / ".train.json.draft"
+    draft.write_text(json.dumps(settings, indent=1))
+    draft.replace(file)
+
+
+def save_state(out: Path, model: nn.Module, optimizer: torch.optim.Optimizer, n: int) -> None:
+    """Everything that a later process needs to go on, in one file, replaced atomically."""
+    tensors = {f"model.{name}": t for name, t in model.state_dict().items()}
+    for i, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{i}.{name}": t for name, t in state.items()}
+    tensors["n"] = torch.tensor(n)
+    draft = out / ".state.safetensors.draft"
+    save_file(tensors, draft)
+    draft.replace(out / "state.safetensors")
+
+
+def read_state(out: Path) -> dict[str, Tensor]:
+    """What ``save_state`` kept; empty before that.
+
+    Raises:
+        TrainError: the file is damaged.
+    """
+    file = out / "state.safetensors"
+    if not file.exists():
+        return {}
+    try:
+        return load_file(file)
+    except SafetensorError as error:
+        raise TrainError(
+            "the saved state is damaged",
+            expected="the file as it was written",
+            got=error,
+            where=file,
+            do="restore it from a copy, or delete the folder to begin anew",
+        ) from error
+
+
+def restore(tensors: dict[str, Tensor], model: nn.Module, optimizer: torch.optim.Optimizer) -> int:
+    """Put a state into the model and the optimizer; returns the batches done so far."""
+    if not tensors:
+        return 0
+    named = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+    model.load_state_dict(named, strict=True)
+    states: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in tensors.items():
+        if key.startswith("optimizer."):
+            _, i, name = key.split(".", 2)
+            states.setdefault(int(i), {})[name] = tensor
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": states, "param_groups": groups})
+    return int(tensors["n"])
+
+
+def append_log(out: Path, line: dict[str, Any]) -> None:
+    """One more line of log.jsonl."""
+    with (out / "log.jsonl").open("a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def cut_log(out: Path, n: int) -> None:
+    """Drop what is logged of batches after the first n: it will be logged again."""
+    file = out / "log.jsonl"
+    if not file.exists():
+        return
+    lines = [line for line in file.read_text().splitlines() if _batch_of(line) <= n]
+    draft = out / ".log.jsonl.draft"
+    draft.write_text("".join(f"{line}\n" for line in lines))
+    draft.replace(file)
+
+
+def _batch_of(line: str) -> float:
+    try:
+        return float(json.loads(line)["batch"])
+    except ValueError:  # a process died while it wrote this line
+        return float("inf")
