@@ -10,16 +10,18 @@ import shlex
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import weighttraj as wt
-from tipl.report import insert_markdown
+from tipl.report.markdown import places, render, rewrite
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("cards/**/*.md")])]
 BLOCKS = re.findall(r"```(python|bash)\n(.*?)```", README, re.DOTALL)
 
 # The commands run as they stand, on a shorter recipe and with less of what only takes time.
@@ -85,15 +87,25 @@ def test_the_makefile_runs_the_readmes_commands() -> None:
         assert command.split("  ")[0] in makefile
 
 
-def test_the_numbers_come_from_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_numbers_come_from_their_files(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every place of results whose file is here; a file that is not yet there has no numbers."""
     monkeypatch.chdir(ROOT)
-    page = tmp_path / "README.md"
-    page.write_text(README)
-    source = Path("datasets/demo/results.json")
-    insert_markdown(json.loads(source.read_text()), source, page)
-    assert page.read_text() == README, (
-        "run: tipl report datasets/demo/results.json --into README.md"
-    )
+    text = page.read_text()
+    for source in {place.source for place in places(text) if place.what == "results"}:
+        if not Path(source).exists():
+            assert all(place.empty for place in places(text) if place.source == source), source
+            continue
+        results = json.loads(Path(source).read_text())
+        fresh = rewrite(text, "results", source, partial(render, results, Path(source)))
+        assert fresh == text, f"run: tipl report {source} --into {page.relative_to(ROOT)}"
+    for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
+        assert (page.parent / picture).exists(), picture
+
+
+def test_readme_shows_the_demo() -> None:
+    shown = [(place.what, place.source, place.empty) for place in places(README)]
+    assert shown == [("results", "datasets/demo/results.json", False)]
 
 
 def test_the_benchmarks_come_from_the_file() -> None:

@@ -23,8 +23,12 @@ try:
     from tipl.baselines import HORIZONS, TrainingConfig
     from tipl.distributed import rank_here
     from tipl.evaluation import EvaluateConfig
+    from tipl.gate import GateTrainConfig, train_gate
+    from tipl.refit import check_model
     from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
+    from tipl.zoo.card import HEADLINE, listed, write_card
+    from tipl.zoo.release import release
 except WeightTrajError as error:
     sys.exit(f"error: {error}")
 
@@ -45,6 +49,15 @@ def _train(config: TrainConfig) -> None:
     tipl.train(config, console=console)
     if rank_here() == 0:
         print(f"model in {config.out}")
+
+
+@app.command(name="train-gate")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _train_gate(config: GateTrainConfig) -> None:
+    """Train tipl-gate on the training runs of one or several data sets, or go on; minutes."""
+    signal.signal(signal.SIGTERM, _stop)
+    train_gate(config, console=console)
+    print(f"model in {config.out}")
 
 
 @app.command(name="fit")
@@ -100,18 +113,86 @@ def _evaluate(args: _Evaluate) -> None:
     print(f"report: {config.out / 'report.html'}")
 
 
+@app.command(name="check")
+def _check(
+    model: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, a model of the zoo, or a baseline")
+    ],
+    data: Annotated[Path, tyro.conf.arg(help="a data set; its first test run is used")],
+    out: Annotated[Path, tyro.conf.arg(help="a JSON file")],
+    horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="snapshots ahead")] = (1, 2, 5, 10),
+    null_batches: Annotated[int, tyro.conf.arg(help="of a training on random walks")] = 2_000,
+    null_walks: Annotated[int, tyro.conf.arg(help="two are forecast, the others trained on")] = 12,
+    seed: Annotated[int, tyro.conf.arg(help="of walks, symmetries and that training")] = 0,
+) -> None:
+    """Five tests that a causal forecaster should pass, as numbers.
+
+    Whether it finds something in random walks, looks ahead, follows permuted and flipped units and
+    longer steps, and goes on along a line.
+    """
+    found = check_model(
+        tipl.load(model),
+        data,
+        horizons=horizons,
+        batches=null_batches,
+        walks=null_walks,
+        seed=seed,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(found, indent=1) + "\n")
+    for name, passed in found["passed"].items():
+        print(f"{name}: {'passes' if passed else 'fails'}, {found[name]}")
+
+
+@app.command(name="zoo")
+def _zoo() -> None:
+    """List the released models."""
+    table = Table()
+    for column in ("name", "kind", "causal", "data set", *HEADLINE):
+        table.add_column(column, justify="right" if column in HEADLINE else "left")
+    for name in tipl.zoo.names():
+        table.add_row(*(escape(text) for text in listed(name)))
+    console.print(table)
+
+
+@app.command(name="release")
+def _release(
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="of a trained model")],
+    name: Annotated[str, tyro.conf.arg(help="in the zoo")],
+    results: Annotated[
+        Path | None, tyro.conf.arg(help="results.json that judged the model of the zoo")
+    ] = None,
+    checks: Annotated[Path | None, tyro.conf.arg(help="what `tipl check` wrote of it")] = None,
+    log: Annotated[bool, tyro.conf.arg(help="keep some lines of the training's log")] = True,
+) -> None:
+    """Put a model into the zoo: once as a draft, and with its results after it was judged there."""
+    out = release(folder, name, results=results, checks=checks, log=log)
+    print(f"model in {out}")
+    if results is None:
+        print(f"a draft: judge it with `tipl evaluate {name} ...`, then give --results")
+
+
+@app.command(name="card")
+def _card(
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="a model of the zoo")],
+    out: Annotated[Path, tyro.conf.arg(help="folder of the cards")] = Path("cards/models"),
+) -> None:
+    """Write the card of a model, or the figures of its metrics.json into the card that is there."""
+    print(f"card in {write_card(name, out)}")
+
+
 @app.command(name="report")
 def _report(
     results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a results.json")],
     into: Annotated[
-        Path | None, tyro.conf.arg(help="rewrite the results' table in this Markdown page")
+        Path | None, tyro.conf.arg(help="rewrite the places of these results in a Markdown page")
     ] = None,
 ) -> None:
-    """Write the page and figures of a result file again, or its table into a Markdown page."""
+    """Write the page and figures of a result file again, or its places in a Markdown page."""
     document = json.loads(results.read_text())
     if into is not None:
         report.insert_markdown(document, results, into)
-        print(f"table in {into}")
+        print(f"results in {into}")
     else:
         print(f"report: {report.write_report(document, results.parent)}")
 

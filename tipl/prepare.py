@@ -64,11 +64,12 @@ def prepare(data: Path, *, rank: int, window: int) -> Prepared:
         validation=[_cut(_tokens(run, rank), longest) for run in held_out],
         every=_every(train[0]),
         longest=longest,
-        digests={run.id: _digest(run) for run in train},
+        digests={run.id: digest_of(run) for run in train},
     )
 
 
-def _digest(run: wt.Run) -> str:
+def digest_of(run: wt.Run) -> str:
+    """Hash of all weights of a run."""
     return hashlib.sha256(run["digest"][:].tobytes()).hexdigest()
 
 

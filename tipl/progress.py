@@ -16,15 +16,16 @@ class TrainingBar:
         total: batches of the whole training.
         start: batches done before.
         console: where to draw.
+        error: what the error is called.
     """
 
-    def __init__(self, total: int, start: int, console: Console) -> None:
+    def __init__(self, total: int, start: int, console: Console, error: str = "WPE") -> None:
         # Twice a second: drawing takes time from the training.
         self._progress = Progress(
             TextColumn("training"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[speed]:.3g} batches/s, WPE {task.fields[wpe]:.3g}"),
+            TextColumn("{task.fields[speed]:.3g} batches/s, " + error + " {task.fields[wpe]:.3g}"),
             TimeRemainingColumn(),
             console=console,
             refresh_per_second=2,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Collection
 from pathlib import Path
@@ -26,7 +27,7 @@ def keep_settings(out: Path, settings: dict[str, Any], may_differ: Collection[st
     Raises:
         TrainError: the folder holds a training with other settings.
     """
-    file = out / "train.json"
+    file, settings = out / "train.json", json.loads(json.dumps(settings))
     if file.exists():
         old = json.loads(file.read_text())
         other = {k: v for k, v in settings.items() if old.get(k) != v and k not in may_differ}
@@ -103,14 +104,17 @@ def cut_log(out: Path, n: int) -> None:
     file = out / "log.jsonl"
     if not file.exists():
         return
-    lines = [line for line in file.read_text().splitlines() if _batch_of(line) <= n]
     draft = out / ".log.jsonl.draft"
-    draft.write_text("".join(f"{line}\n" for line in lines))
+    draft.write_text("".join(f"{json.dumps(x)}\n" for x in read_log(out) if x["batch"] <= n))
     draft.replace(file)
 
 
-def _batch_of(line: str) -> float:
-    try:
-        return float(json.loads(line)["batch"])
-    except ValueError:  # a process died while it wrote this line
-        return float("inf")
+def read_log(out: Path) -> list[dict[str, float]]:
+    """The lines of log.jsonl; without one that a process was writing when it died."""
+    file = out / "log.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    found = []
+    for line in lines:
+        with contextlib.suppress(ValueError):
+            found.append(json.loads(line))
+    return found

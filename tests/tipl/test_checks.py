@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 import weighttraj as wt
-from tipl import Persistence, Reconstruction
+from tipl import TIPL, Persistence, Reconstruction
 from tipl.baselines import (
     DMD,
     WNN,
@@ -35,10 +36,14 @@ from tipl.checks import (
     scale,
     skills,
 )
+from tipl.forecast import TIPLConfig
+from tipl.models.gpt import GPT, GPTConfig
+from tipl.refit import RefitConfig, refit_of
 from weighttraj.policies import load_policies
 
 HORIZONS = (1, 2, 5, 10)
-BRIEFLY = TrainingConfig(steps=60, batch_size=1024)
+STEPS = 60
+BRIEFLY = TrainingConfig(steps=STEPS, batch_size=1024)
 
 
 def regression(features: object, by_phase: bool = False) -> Fit:
@@ -100,8 +105,41 @@ def test_baselines_without_a_fit(
 
 @pytest.mark.parametrize(("fit", "fails"), FITTED, ids=label)
 def test_baselines_with_a_fit(fit: Fit, fails: set[str], runs: list[wt.Run], folder: Path) -> None:
-    found = check(fit(runs), runs[0], folder, fit=fit, horizons=HORIZONS)
+    fitted = fit(runs)
+    refit = refit_of(fitted, RefitConfig(folder=folder, horizons=HORIZONS, batches=STEPS))
+    found = check(fitted, runs[0], folder, fit=refit, horizons=HORIZONS)
     assert {name for name, passed in found.passed.items() if not passed} == fails, found
+
+
+def test_what_has_no_fit_is_not_refitted(folder: Path) -> None:
+    config = RefitConfig(folder=folder, horizons=HORIZONS)
+    for forecaster in (Persistence(), Extrapolation(Steps(1)), DMD(), Reconstruction(3)):
+        assert refit_of(forecaster, config) is None
+
+
+def test_a_refit_is_of_the_same_kind_and_sizes(
+    runs: list[wt.Run], folder: Path, tmp_path: Path
+) -> None:
+    gpt = GPTConfig(rank=3, max_timestep=48, block_size=4, n_layer=2, n_head=2, n_embd=8)
+    old = TIPL(GPT(gpt), TIPLConfig(gpt=gpt, every=2))
+    config = RefitConfig(folder=tmp_path, horizons=(1,), batches=3)
+    walks = random_walks(runs[0], folder, count=2)
+    fit = refit_of(old, config)
+    assert fit is not None
+    found = fit(walks)
+    assert isinstance(found, TIPL)
+    assert found.config == replace(old.config, gpt=replace(gpt, max_timestep=299))
+    trained = [run.weights[:] for run in wt.open(tmp_path / "walks").split("train")]
+    assert all(np.array_equal(a, b.weights[:]) for a, b in zip(trained, walks, strict=True))
+    assert np.isfinite(skills(found, walks[:1], [1])).all()
+
+    by_phase = Regression.fit(runs, Ema(0.9), by_phase=True, horizons=(1, 5))
+    again = refit_of(by_phase, config)
+    assert again is not None
+    other = again(walks)
+    assert isinstance(other, Regression)
+    assert (other.name, other.horizons) == (by_phase.name, (1,))
+    assert not np.array_equal(other.coefficients, by_phase.coefficients[:, :1])
 
 
 def test_the_null_sees_a_forecaster_that_knows_the_future(runs: list[wt.Run], folder: Path) -> None:

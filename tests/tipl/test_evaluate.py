@@ -14,9 +14,10 @@ import weighttraj as wt
 from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evaluate, load, train
 from tipl.errors import EvaluateError
 from tipl.evaluation import measure
-from tipl.evaluation.parts import Parts
-from tipl.evaluation.starts import at_boundary, learning_phase, starts_of
+from tipl.evaluation.parts import Parts, fingerprint
+from tipl.evaluation.starts import Starts, at_boundary, learning_phase, starts_of
 from tipl.evaluation.statistics import Bootstrap, interquartile_mean, mean, ratio_of_sums
+from tipl.evaluation.summary import Summary
 from tipl.evaluation.weights import squared_errors
 from tipl.report import verdict
 from weighttraj.policies import ReturnsConfig, fill_returns
@@ -236,6 +237,40 @@ def test_gain_is_zero_for_the_copy_and_one_for_the_truth(results: dict[str, Any]
             assert row["forecast"] == row["now"]
         floor = results["forecasters"]["reconstruction-8"]["gain"][mode]
         assert [row["h"] for row in floor] == [1, 3]
+
+
+def test_repw_is_compared_with_the_copys_run_by_run(data: Path) -> None:
+    """Errors 1.5 times the copy's in each run, up to h = 10 and while it learns."""
+    gaps = np.array([1.0, 7.0, 40.0])[:, None, None, None] * np.ones((3, 3, 3, 3))
+    factor = np.full((3, 3, 3), 1.5)  # mode, start, horizon
+    factor[:, 2] = factor[..., 2] = 100  # the plateau; h = 20
+    measured = [
+        measure.Measured(
+            run=str(i),
+            starts=Starts(weights=np.arange(4), learning=np.array([1, 2]), plateau=np.array([3])),
+            boundary=np.zeros(4, bool),
+            function_starts=np.zeros(0, int),
+            function_boundary=np.zeros(0, bool),
+            tensors=np.array([2]),
+            weights={name: {"squared": np.ones((4, 2, 1))} for name in ("copy", "model")},
+            functions={},
+            true={"now": np.zeros((3, 3)), "later": gap, "fresh": gap[..., :1]},
+            returns={"copy": {"forecast": 0 * gap}, "model": {"forecast": gap * (1 + factor)}},
+        )
+        for i, gap in enumerate(gaps)
+    ]
+    config = EvaluateConfig(data=data, out=data, horizons=(1, 2), return_horizons=(1, 3, 20))
+    found = Summary(measured, config, "copy").of("model")["repw_ratio"]
+    for mode in ("sampled", "held", "deterministic"):
+        assert [found[mode][end] for end in ("value", "low", "high")] == pytest.approx([1.5] * 3)
+    still = Summary(measured, config, "model").of("copy")["repw_ratio"]["sampled"]
+    assert still["value"] == pytest.approx(1 / 1.5)
+
+
+def test_results_say_which_bytes_were_judged(results: dict[str, Any], model: Path) -> None:
+    marks = {name: scores["fingerprint"] for name, scores in results["forecasters"].items()}
+    assert marks["tipl"] == fingerprint(load(model))
+    assert len(set(marks.values())) == len(marks)
 
 
 def test_held_noise_is_that_of_the_start(data: Path) -> None:

@@ -1,14 +1,42 @@
-"""Forecasters by name and by folder, and the command that fits the baselines."""
+"""Forecasters by name and by folder, the command that fits the baselines, and what is released."""
 
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from safetensors.numpy import load_file, save_file
 
-from tipl import Reconstruction, baselines, cli, load
-from tipl.errors import ForecastError, ModelError
+import weighttraj as wt
+from tipl import (
+    TIPL,
+    EvaluateConfig,
+    Reconstruction,
+    TrainConfig,
+    baselines,
+    cli,
+    evaluate,
+    load,
+    train,
+)
+from tipl.errors import EvaluateError, ForecastError, ModelError
+from tipl.evaluation.parts import fingerprint
+from tipl.forecast import TIPLConfig
+from tipl.models.gpt import GPT, GPTConfig
+from tipl.report.markdown import places
+from tipl.zoo import names
+from tipl.zoo.card import facts, listed, metrics_of, refreshed, write_card
+from tipl.zoo.lookup import MODELS
+from tipl.zoo.metrics import read_metrics
+from tipl.zoo.release import LINES, MOST, release, thinned
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", baselines.names())
@@ -41,8 +69,315 @@ def test_a_folder_with_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"kind": "crystal ball"}')
     with pytest.raises(ModelError, match="crystal ball"):
         load(tmp_path)
+    (tmp_path / "config.json").write_text("[]")
+    with pytest.raises(ModelError, match="the folder holds no forecaster"):
+        load(tmp_path)
 
 
 def test_a_floor_is_saved_and_loaded(tmp_path: Path) -> None:
     Reconstruction(7).save(tmp_path)
     assert load(tmp_path) == Reconstruction(7)
+
+
+# Releases
+
+
+@pytest.fixture(scope="module")
+def trained(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model trained for a moment, with a log."""
+    out = tmp_path_factory.mktemp("trained") / "model"
+    sizes = {"rank": 8, "block_size": 5, "n_layer": 1, "n_embd": 16}
+    train(TrainConfig(data=small_dataset, out=out, n_batches=20, warmup=5, **sizes))
+    return out
+
+
+@pytest.fixture(scope="module")
+def results(trained: Path, small_dataset: Path) -> Path:
+    """What it is worth, in weights."""
+    out = trained.with_name("results")
+    few = {"horizons": (1, 10), "learning_starts": 0, "function_starts": 0, "bootstrap": 50}
+    evaluate([load(trained), load("ema-0.9")], EvaluateConfig(data=small_dataset, out=out, **few))
+    return out / "results.json"
+
+
+@pytest.fixture(scope="module")
+def checks(trained: Path, small_dataset: Path) -> Path:
+    """What it passes, by the command."""
+    file = trained.with_name("checks.json")
+    command = ["tipl", "check", trained, "--data", small_dataset, "--out", file]
+    command += ["--horizons", 1, 10, "--null-batches", 5, "--null-walks", 3]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(word) for word in command])
+        cli.main()
+    return file
+
+
+@pytest.fixture
+def zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty zoo in the place of the package's."""
+    folder = tmp_path / "zoo"
+    monkeypatch.setattr("tipl.zoo.lookup.MODELS", folder)
+    assert names() == []
+    return folder
+
+
+def test_a_released_model_is_loaded_by_name(trained: Path, zoo: Path, small_dataset: Path) -> None:
+    release(trained, "tipl-small")
+    assert names() == ["tipl-small"]
+    model = load("tipl-small")
+    assert model.name == "tipl-small"
+    run = wt.open(small_dataset).split("test").runs[0]
+    assert np.array_equal(
+        model.forecast(run, [10, 20], [1, 5]), load(trained).forecast(run, [10, 20], [1, 5])
+    )
+    assert listed("tipl-small") == ("tipl-small", "tipl", "-", "-", "-", "-", "-")
+    with pytest.raises(ModelError, match="no released model of this name with results"):
+        metrics_of("tipl-small")
+
+
+def test_a_folder_comes_before_the_zoo(
+    trained: Path, zoo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    release(trained, "tipl-small")
+    Reconstruction(3).save(tmp_path / "tipl-small")
+    monkeypatch.chdir(tmp_path)
+    assert load("tipl-small") == Reconstruction(3)
+
+
+def test_metrics_say_everything(trained: Path, zoo: Path, results: Path, checks: Path) -> None:
+    out = release(trained, "tipl-small", results=results, checks=checks)
+    assert {path.name for path in out.iterdir()} == {
+        "config.json",
+        "model.safetensors",
+        "metrics.json",
+    }
+    found = read_metrics(out)
+    assert found is not None
+    assert (found.name, found.kind, found.causal) == ("tipl-small", "tipl", False)
+    assert found.trained_on is not None
+    assert found.trained_on.runs == ("seed0000", "seed0001")
+    assert (found.trained_on.data, found.trained_on.every) == ("small", 2)
+    assert found.trained_on.environment == "InvertedPendulum-v4"
+    assert found.results["runs"] == ["seed0002", "seed0003"]
+    judged = json.loads(results.read_text())["forecasters"]
+    assert set(found.results["forecasters"]) == set(judged)
+    assert (
+        found.scores["skill"]["ratio_of_sums"]["all"]
+        == (judged["model"]["skill"]["ratio_of_sums"]["all"])
+    )
+    assert found.settings["rank"] == 8
+    assert not {"out", "data", "runs"} & set(found.settings)
+    assert [line["batch"] for line in found.log] == [20]
+    assert found.checks == json.loads(checks.read_text())
+    assert str(trained) not in (out / "metrics.json").read_text().replace(
+        found.checks["command"], ""
+    )
+    line = listed("tipl-small")
+    assert line[:4] == ("tipl-small", "tipl", "no", "small")
+    assert "[" in line[4]  # an interval
+
+
+def test_results_of_other_bytes_are_refused(
+    trained: Path, zoo: Path, results: Path, checks: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(trained, other)
+    arrays = load_file(other / "model.safetensors")
+    arrays["head.bias"][0] += 1e-6
+    save_file(arrays, other / "model.safetensors")
+    with pytest.raises(ModelError, match=r"not of this model(.|\n)*tipl evaluate other ..."):
+        release(other, "other", results=results)
+    release(trained, "tipl-small", results=results)
+    document = json.loads(results.read_text())
+    (tmp_path / "train.json").write_text(json.dumps(document | {"split": "train"}))
+    with pytest.raises(ModelError, match="runs that it has not seen"):
+        release(trained, "tipl-small", results=tmp_path / "train.json")
+    wrong = json.loads(checks.read_text()) | {"fingerprint": "0"}
+    (tmp_path / "checks.json").write_text(json.dumps(wrong))
+    with pytest.raises(ModelError, match="the checks are not of this model"):
+        release(trained, "tipl-small", results=results, checks=tmp_path / "checks.json")
+    # A new draft of other bytes has no figures; one of the same bytes keeps them.
+    release(trained, "tipl-small")
+    assert read_metrics(zoo / "tipl-small") is not None
+    with pytest.raises(ModelError, match="not of this model"):
+        release(other, "tipl-small", results=results)
+    assert read_metrics(zoo / "tipl-small") is None
+
+
+def big(folder: Path, n_embd: int) -> TIPL:
+    """An untrained model of some size, in a folder."""
+    torch.manual_seed(0)
+    gpt = GPTConfig(rank=8, max_timestep=100, block_size=5, n_embd=n_embd)
+    model = TIPL(GPT(gpt), TIPLConfig(gpt=gpt, every=2))
+    model.save(folder)
+    return model
+
+
+def test_a_large_model_is_rounded_and_is_float32_again(
+    zoo: Path, tmp_path: Path, small_dataset: Path
+) -> None:
+    model = big(tmp_path / "big", 160)
+    assert (tmp_path / "big/model.safetensors").stat().st_size > MOST
+    out = release(tmp_path / "big", "big")
+    stored = load_file(out / "model.safetensors")
+    assert {str(array.dtype) for array in stored.values()} == {"float16", "float32"}
+    assert all(array.dtype == np.float32 for array in stored.values() if array.ndim == 1)
+    assert (out / "model.safetensors").stat().st_size < MOST
+    loaded = load("big")
+    assert isinstance(loaded, TIPL)
+    assert {p.dtype for p in loaded.model.state_dict().values()} == {torch.float32}
+    run = wt.open(small_dataset).split("test").runs[0]
+    rounded, exact = (m.forecast(run, [10], [1, 5]) for m in (loaded, model))
+    assert not np.array_equal(rounded, exact)
+    np.testing.assert_allclose(rounded, exact, atol=0.02 * np.abs(exact).max())
+    release(tmp_path / "big", "big")  # the same bytes
+    assert all(
+        np.array_equal(v, stored[k]) for k, v in load_file(out / "model.safetensors").items()
+    )
+
+
+def test_what_is_judged_before_it_is_rounded_is_refused(
+    zoo: Path, tmp_path: Path, small_dataset: Path
+) -> None:
+    model = big(tmp_path / "big", 160)
+    few = {"horizons": (1,), "learning_starts": 0, "function_starts": 0, "bootstrap": 10}
+
+    def judged(forecaster: Any, out: Path) -> Path:
+        evaluate([forecaster], EvaluateConfig(data=small_dataset, out=out, starts=5, **few))
+        return out / "results.json"
+
+    with pytest.raises(ModelError, match="not of this model"):
+        release(tmp_path / "big", "big", results=judged(model, tmp_path / "early"))
+    out = release(tmp_path / "big", "big", results=judged(load("big"), tmp_path / "late"))
+    assert read_metrics(out) is not None
+
+
+def test_a_model_that_is_too_large_is_refused(zoo: Path, tmp_path: Path) -> None:
+    big(tmp_path / "big", 256)
+    with pytest.raises(ModelError, match="too large for the zoo"):
+        release(tmp_path / "big", "big")
+    assert names() == []
+
+
+@pytest.mark.parametrize("name", ["../up", "Upper", "ema-0.9", ""])
+def test_bad_names_are_refused(name: str, trained: Path, zoo: Path) -> None:
+    with pytest.raises(ModelError, match="cannot be called this"):
+        release(trained, name)
+
+
+def test_a_log_is_thinned_evenly_on_a_logarithmic_scale(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    lines = [{"batch": n, "wpe": 1 / n, "batches_per_s": 3.0} for n in range(1, 501)]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    found = thinned(log)
+    batches = [line["batch"] for line in found]
+    assert 50 < len(batches) <= LINES
+    assert (batches[0], batches[-1]) == (1, 500)
+    assert batches == sorted(set(batches))
+    assert batches[len(batches) // 2] < 100
+    assert found[0] == {"batch": 1, "wpe": 1.0}
+    assert thinned(tmp_path / "nothing.jsonl") == []
+
+
+# Cards
+
+
+def test_a_card_keeps_its_prose(
+    trained: Path, zoo: Path, results: Path, checks: Path, tmp_path: Path
+) -> None:
+    release(trained, "tipl-small", results=results, checks=checks)
+    card = write_card("tipl-small", tmp_path / "cards")
+    text = card.read_text()
+    assert text.startswith("---\nlicense: mit\n")
+    assert "## What is ours" in text
+    assert "datasets:\n- small\n" in text
+    assert {place.section for place in places(text) if not place.empty} == {
+        "summary",
+        "ladder",
+        "checks",
+        "training",
+        "commands",
+    }
+    assert (card.parent / "tipl-small.svg").read_text().count("<svg") == 1
+    assert not [line for line in text.splitlines() if line.endswith("{{") or "{%" in line]
+    headings = [line for line in text.split("\n\n") if line.startswith("#")]
+    after = [text.split(f"{head}\n\n", 1)[1] for head in headings if "\n" not in head]
+    assert not any(rest.startswith("#") for rest in after)
+    mine = text.replace("## Limits", "Prose by hand.\n\n## Limits")
+    stale = mine.replace("learnt from: `small`", "learnt from: `other`")
+    assert stale != mine
+    card.write_text(stale)
+    write_card("tipl-small", tmp_path / "cards")
+    assert card.read_text() == mine
+
+
+def test_what_was_not_measured_leaves_no_heading(
+    trained: Path, zoo: Path, results: Path, tmp_path: Path
+) -> None:
+    release(trained, "tipl-small", results=results, log=False)
+    metrics = metrics_of("tipl-small")
+    assert facts(metrics, "checks") == ""
+    text = write_card("tipl-small", tmp_path / "cards").read_text()
+    assert "Five checks" not in text
+    assert not list((tmp_path / "cards").glob("*.svg"))
+    assert "![" not in text
+
+
+def test_cards_refuse_what_they_cannot_say(
+    trained: Path, zoo: Path, results: Path, tmp_path: Path
+) -> None:
+    release(trained, "tipl-small", results=results)
+    metrics = metrics_of("tipl-small")
+    with pytest.raises(ModelError, match=r"no such section of a card(.|\n)*summary, ladder"):
+        facts(metrics, "poem")
+    with pytest.raises(EvaluateError, match="no place for these facts"):
+        refreshed("# A card of something else\n", metrics)
+
+
+def test_the_checks_of_tipl_show_its_look_ahead(checks: Path) -> None:
+    found = json.loads(checks.read_text())
+    assert (found["fitted_to_walks"], found["batches"], found["run"]) == (True, 5, "seed0002")
+    assert list(found["null"]) == ["1", "10"]
+    assert found["passed"]["causality"] is False
+    assert found["drift"] is None  # a line has two directions, its basis eight
+    assert found["passed"]["drift"] is False
+
+
+def test_the_commands_go_all_the_way(
+    trained: Path,
+    checks: Path,
+    zoo: Path,
+    small_dataset: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def call(*arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["tipl", *map(str, arguments)])
+        cli.main()
+        return capsys.readouterr().out
+
+    monkeypatch.chdir(tmp_path)
+    assert "a draft: judge it with" in call("release", trained, "--name", "tipl-a")
+    few = ["--learning-starts", "0", "--function-starts", "0", "--bootstrap", "10"]
+    data = ["--data", small_dataset]
+    call("evaluate", "tipl-a", *data, "--out", "judged", "--horizons", "1", "10", *few)
+    files = ["--results", "judged/results.json", "--checks", checks]
+    call("release", trained, "--name", "tipl-a", *files)
+    assert "tipl-a" in call("zoo")
+    assert "card in cards/models/tipl-a.md" in call("card", "tipl-a")
+    text = Path("cards/models/tipl-a.md").read_text()
+    assert "tipl evaluate tipl-a" in text
+    assert "| a straight line | its basis needs more directions | no |" in text
+    assert "| the future moves no bit | other bits | no |" in text
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_judged_model_has_a_card_that_says_its_metrics(name: str) -> None:
+    metrics = read_metrics(MODELS / name)
+    assert metrics is not None, "a draft: judge it and release it again"
+    assert metrics.fingerprint == fingerprint(load(name)), "not the bytes that were judged"
+    card = ROOT / f"cards/models/{name}.md"
+    assert card.exists(), f"run: tipl card {name}"
+    text = card.read_text()
+    assert refreshed(text, metrics_of(name)) == text, f"run: tipl card {name}"

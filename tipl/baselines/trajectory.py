@@ -67,25 +67,14 @@ class Trajectory:
         return len(self.weights)
 
     def sample(self, limit: int, rng: np.random.Generator) -> Trajectory:
-        """At most about so many parameters, in memory, some of each tensor.
-
-        Each tensor has a share by its size, small ones at least half of an equal share.
-        """
-        size, tensors = len(self.tensor), int(self.tensor.max()) + 1
-        chosen, importance = [], []
-        for number in range(tensors):
-            mine = np.flatnonzero(self.tensor == number)
-            share = max(limit * len(mine) // size, limit // (2 * tensors), 1)
-            some = np.sort(rng.permutation(mine)[:share]) if size > limit else mine
-            chosen.append(some)
-            importance.append(self.importance[some] * len(mine) / len(some))
-        columns = np.concatenate(chosen)
+        """At most about so many parameters, in memory, some of each tensor."""
+        columns, counts = stratified(self.tensor, limit, rng)
         return Trajectory(
-            weights=_columns(self.weights, columns),
+            weights=columns_of(self.weights, columns),
             phase=np.asarray(self.phase[:]),
             tensor=self.tensor[columns],
             matrix=self.matrix[columns],
-            importance=np.concatenate(importance),
+            importance=self.importance[columns] * counts,
         )
 
     def windows(
@@ -128,6 +117,24 @@ class Reader:
             self._block = self._weights[self._first : self._stop]
         part = self._block[first - self._first : stop - self._first]
         return part.astype(np.float64)
+
+
+def stratified(
+    tensor: Int[np.ndarray, " param"], limit: int, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, " some"], Float64[np.ndarray, " some"]]:
+    """At most about so many parameters, some of each tensor, and how many each stands for.
+
+    Each tensor has a share by its size, small ones at least half of an equal share.
+    """
+    size, tensors = len(tensor), int(tensor.max()) + 1
+    chosen, counts = [], []
+    for number in range(tensors):
+        mine = np.flatnonzero(tensor == number)
+        share = max(limit * len(mine) // size, limit // (2 * tensors), 1)
+        some = np.sort(rng.permutation(mine)[:share]) if size > limit else mine
+        chosen.append(some)
+        counts.append(np.full(len(some), len(mine) / len(some)))
+    return np.concatenate(chosen), np.concatenate(counts)
 
 
 def samples(
@@ -175,11 +182,21 @@ def _tensors(layout: ParamLayout) -> tuple[np.ndarray, np.ndarray]:
     return np.repeat(np.arange(len(sizes)), sizes), np.repeat(matrix, sizes)
 
 
-def _columns(weights: Rows, columns: np.ndarray) -> Float32[np.ndarray, "time some"]:
+def columns_of(weights: Rows, columns: np.ndarray) -> Float32[np.ndarray, "time some"]:
     """Some columns of all rows, read block by block."""
     rows = max(1, 4 * MAX_BYTES // (4 * weights.shape[1]))
     blocks = [weights[a : a + rows][:, columns] for a in range(0, len(weights), rows)]
     return np.ascontiguousarray(np.concatenate(blocks))
 
 
-__all__ = ["SAMPLE", "Reader", "Rows", "Trajectory", "renewal", "samples", "thinned"]
+__all__ = [
+    "SAMPLE",
+    "Reader",
+    "Rows",
+    "Trajectory",
+    "columns_of",
+    "renewal",
+    "samples",
+    "stratified",
+    "thinned",
+]

@@ -17,6 +17,7 @@ from tipl.baselines import Persistence, Reconstruction
 from tipl.errors import EvaluateError
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.measure import Measured, Task, function_starts, measure
+from tipl.evaluation.parts import fingerprint
 from tipl.evaluation.returns import MODES, is_floor
 from tipl.evaluation.starts import starts_of
 from tipl.evaluation.summary import Summary
@@ -90,7 +91,12 @@ def evaluate(
         },
         "noise_floor": summary.noise() if config.learning_starts else {},
         "forecasters": {
-            f.name: {"causal": f.causal, "floor": is_floor(f), **summary.of(f.name)}
+            f.name: {
+                "causal": f.causal,
+                "floor": is_floor(f),
+                "fingerprint": fingerprint(f),
+                **summary.of(f.name),
+            }
             for f in everyone
         },
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),

@@ -25,6 +25,8 @@ KINDS = ("all", "within", "boundary")
 AGGREGATES = ("ratio_of_sums", "mean_of_ratios", "tensors_equal")
 """Skill: of the summed errors; the mean over starts of each one's; the mean over tensors."""
 PHASES = ("learning", "plateau")
+NEAR = 10
+"""The paper's horizons end here."""
 
 Errors = Float[np.ndarray, "run start horizon *tensor"]
 Chosen = Bool[np.ndarray, "run start"]
@@ -50,6 +52,7 @@ class Summary:
             scores["function_skill"] = self._function_skills(name)
         if self._measured[0].true:
             scores["repw"] = self._repw(name)
+            scores["repw_ratio"] = self._repw_ratio(name)
             scores["gain"] = self._gain(name)
             scores["scatter"] = self._scatter(name)
         return scores
@@ -96,18 +99,36 @@ class Summary:
 
     def _repw(self, name: str) -> dict[str, Any]:
         """|J(true) - J(forecast)|, means over the starts of each run."""
-        found: dict[str, Any] = {}
-        for i, mode in enumerate(MODES):
-            found[mode] = {}
-            for phase in PHASES:
-                gaps = [
-                    _mean(np.abs(later - forecast))
-                    for _, later, forecast in self._arms(name, i, phase)
-                ]
-                found[mode][phase] = self._rows(
-                    self._config.return_horizons, self._bootstrap.interval(mean, np.stack(gaps))
+        horizons = self._config.return_horizons
+        return {
+            mode: {
+                phase: self._rows(
+                    horizons, self._bootstrap.interval(mean, self._gaps(name, i, phase))
                 )
+                for phase in PHASES
+            }
+            for i, mode in enumerate(MODES)
+        }
+
+    def _repw_ratio(self, name: str) -> dict[str, Interval]:
+        """REPW over the copy's in the learning phase, both summed over the paper's horizons.
+
+        Paired: an interval draws a run with its errors of both.
+        """
+        near = [i for i, h in enumerate(self._config.return_horizons) if h <= NEAR]
+        found = {}
+        for i, mode in enumerate(MODES):
+            ours, copy = (
+                self._gaps(each, i, "learning")[:, near].sum(1, keepdims=True)
+                for each in (name, self._copy)
+            )
+            (found[mode],) = self._bootstrap.interval(ratio_of_sums, ours, copy)
         return found
+
+    def _gaps(self, name: str, mode: int, phase: str) -> Float[np.ndarray, "run horizon"]:
+        """REPW of each run: a mean over its starts, NaN where it has none."""
+        arms = self._arms(name, mode, phase)
+        return np.stack([_mean(np.abs(later - forecast)) for _, later, forecast in arms])
 
     def _gain(self, name: str) -> dict[str, Any]:
         """What a forecast earns of what training earns, over the learning phase."""
@@ -198,4 +219,4 @@ def _mean(values: np.ndarray) -> np.ndarray:
     return mean(values) if len(values) else np.full(values.shape[1:], np.nan)
 
 
-__all__ = ["AGGREGATES", "KINDS", "PHASES", "Summary"]
+__all__ = ["AGGREGATES", "KINDS", "NEAR", "PHASES", "Summary"]

@@ -1,128 +1,202 @@
-"""Results as pictures."""
+"""Results as pictures.
+
+A few forecasters have colours: the models, the copy and the best baselines. The others are grey, so
+that twenty of them leave a picture that can be read. Floors are dashed.
+"""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tipl.report.scores import (
+    COPY,
+    FUNCTION_SKILL,
+    SKILL,
+    Row,
+    floors,
+    models,
+    rows_of,
+    that_matter,
+)
 from tipl.report.tables import MODE_NAMES, label
 
-COLORS = {"tipl": "#c0392b", "persistence": "#2c3e50"}
-_FLOOR = "#7f8c8d"
-_MANY = 12
-"""So many forecasters at most are drawn into the paper's figure."""
+OTHERS = "other baselines"
+"""Their entry in legends."""
+_OF_MODELS = ("#c0392b", "#e67e22", "#8e44ad", "#d6529e")
+_OF_BASELINES = ("#2471a3", "#17a589", "#7d6608", "#5dade2")
+_COPY, _GREY = "#1c1c1c", "#a6acaf"
+_LOWEST = -0.5
+"""Skills and gains below are cut off."""
+
+Style = dict[str, Any]
+"""Of a line, as ``Axes.plot`` takes it."""
 
 
 def figures(results: dict[str, Any]) -> dict[str, Figure]:
     """All figures of a page, by title."""
-    found = {"Skill against horizon": skill_figure(results)}
+    return {title: draw() for title, draw in _plans(results).items()}
+
+
+def titles(results: dict[str, Any]) -> list[str]:
+    """Of all figures of a page; nothing is drawn."""
+    return list(_plans(results))
+
+
+def file_name(title: str) -> str:
+    """What the picture of this title is called on disk."""
+    return title.lower().replace("'", "").replace(",", "").replace(" ", "-") + ".png"
+
+
+def _plans(results: dict[str, Any]) -> dict[str, Callable[[], Figure]]:
+    found = {"Skill against horizon": partial(skill_figure, results)}
     if results["modes"]:
-        found["Inference gain against horizon"] = gain_figure(results)
+        found["Inference gain against horizon"] = partial(gain_figure, results)
         found |= {
-            f"The paper's figure, {MODE_NAMES[mode]}": paper_figure(results, mode)
+            f"The paper's figure, {MODE_NAMES[mode]}": partial(paper_figure, results, mode)
             for mode in results["modes"]
             if mode != "held"
         }
-    return found
+    return dict(found)
 
 
 def skill_figure(results: dict[str, Any]) -> Figure:
-    """Skill in weights, all starts and at boundaries, and in function; below -0.5 it is cut off."""
-    fig = Figure(figsize=(12, 4.2), layout="constrained")
+    """Skill in weights, all starts and at boundaries, and in function."""
+    fig = Figure(figsize=(12, 4.6), layout="constrained")
     panels = [
-        ("weights, all starts", ("skill", "ratio_of_sums", "all")),
+        ("weights, all starts", SKILL),
         ("weights, next step in a new iteration", ("skill", "ratio_of_sums", "boundary")),
-        ("policies (divergence)", ("function_skill", "all")),
+        ("policies (divergence)", FUNCTION_SKILL),
     ]
     all_axes = fig.subplots(1, 3, sharey=True)
     for axes, (title, path) in zip(all_axes, panels, strict=True):
-        for name, scores in results["forecasters"].items():
-            rows: Any = scores
-            for key in path:
-                rows = rows.get(key, {})
-            _draw_band(axes, name, scores, rows or [])
+        for name, style in styles(results).items():
+            _draw_band(axes, rows_of(results["forecasters"][name], path), style)
         axes.set_xscale("log")
-        axes.set_ylim(-0.5, 1)
+        axes.set_ylim(_LOWEST, 1)
+        _name_those_below(axes)
         axes.set_title(title, fontsize=10)
-        _style(axes, "horizon h, snapshots", "skill" if axes is all_axes[0] else "")
-    _legend(fig, all_axes[0])
+        _label(axes, "horizon h, snapshots", "skill" if axes is all_axes[0] else "")
+    _legend(fig)
     return fig
 
 
 def gain_figure(results: dict[str, Any]) -> Figure:
     """What a forecast earns of what training earns, in each action mode."""
-    fig = Figure(figsize=(12, 4.2), layout="constrained")
+    fig = Figure(figsize=(12, 4.6), layout="constrained")
     all_axes = fig.subplots(1, 3, sharey=True)
     for axes, mode in zip(all_axes, results["modes"], strict=True):
-        for name, scores in results["forecasters"].items():
-            _draw_band(axes, name, scores, scores["gain"][mode])
+        for name, style in styles(results).items():
+            _draw_band(axes, rows_of(results["forecasters"][name], ("gain", mode)), style)
         axes.axhline(1, ls=":", color="black", lw=1)
         axes.set_xscale("log")
-        axes.set_ylim(-0.5, 1.2)
+        axes.set_ylim(_LOWEST, 1.2)
+        _name_those_below(axes)
         axes.set_title(MODE_NAMES[mode], fontsize=10)
-        _style(axes, "horizon h, snapshots", "inference gain" if axes is all_axes[0] else "")
-    _legend(fig, all_axes[0])
+        _label(axes, "horizon h, snapshots", "inference gain" if axes is all_axes[0] else "")
+    _legend(fig)
     return fig
 
 
 def paper_figure(results: dict[str, Any], mode: str) -> Figure:
-    """The paper's figure, with what it leaves out: the copy, the floor and the noise.
+    """The paper's figure, with what it leaves out: the copy, baselines, the floor and the noise.
 
     Left: WPE and REPW against the forecast step. Right: return of the true policy against the
-    return of the forecast policy, over all steps.
+    return of the forecast policy, over all steps, of those that have a colour.
     """
-    fig = Figure(figsize=(12, 4.2), layout="constrained")
+    fig = Figure(figsize=(12, 4.6), layout="constrained")
     wpe, repw, scatter = fig.subplots(1, 3)
-    for name, scores in list(results["forecasters"].items())[:_MANY]:
-        gaps = scores["repw"][mode]["learning"]
-        for axes, rows in ((wpe, scores["wpe"]), (repw, gaps)):
+    coloured = that_matter(results)
+    for name, style in styles(results).items():
+        scores = results["forecasters"][name]
+        for axes, rows in ((wpe, scores["wpe"]), (repw, scores["repw"][mode]["learning"])):
             near = [row for row in rows if row["h"] <= 10]
-            h, y = [row["h"] for row in near], [row["value"] for row in near]
-            axes.plot(h, y, "o-", ms=3, label=label(name), color=_color(name, scores))
-        for points in scores["scatter"][mode]:
-            true, forecast = points["true"], points["forecast"]
-            scatter.plot(true, forecast, "o", ms=2, alpha=0.3, color=_color(name, scores))
+            axes.plot([row["h"] for row in near], [row["value"] for row in near], **style)
+        for points in scores["scatter"][mode] if name in coloured else []:
+            dots = {"ms": 2, "alpha": 0.3, "color": style["color"]}
+            scatter.plot(points["true"], points["forecast"], "o", **dots)
     floor = results["noise_floor"][mode]
     repw.axhline(floor, ls=":", color="black", label="noise: true policy, other episodes")
-    _style(wpe, "forecast step h", "WPE: mean squared error of weights")
+    _label(wpe, "forecast step h", "WPE: mean squared error of weights")
     wpe.set_yscale("log")
-    _style(repw, "forecast step h", "REPW while learning: |J(true) - J(forecast)|")
+    _label(repw, "forecast step h", "REPW while learning: |J(true) - J(forecast)|")
     repw.set_ylim(bottom=0)
-    _style(scatter, "J(true policy)", "J(forecast policy)")
+    _label(scatter, "J(true policy)", "J(forecast policy)")
     scatter.axline((0, 0), slope=1, ls=":", color="black")
-    _legend(fig, repw)
+    _legend(fig)
     return fig
 
 
-def _draw_band(axes: Axes, name: str, scores: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+def styles(results: dict[str, Any]) -> dict[str, Style]:
+    """How each forecaster is drawn."""
+    coloured, ours, dashed = that_matter(results), models(results), floors(results)
+    rivals = [name for name in coloured if name not in (*ours, COPY)]
+    colors = dict(zip(ours, _cycle(_OF_MODELS, len(ours)), strict=True))
+    colors |= dict(zip(rivals, _cycle(_OF_BASELINES, len(rivals)), strict=True))
+    colors[COPY] = _COPY
+    found: dict[str, Style] = {}
+    for name in results["forecasters"]:
+        if name in coloured:
+            line = {"color": colors[name], "marker": "o", "ms": 3, "lw": 1.5, "zorder": 3}
+            found[name] = line | {"label": label(name)}
+        elif name in dashed:
+            line = {"color": "#7f8c8d", "ls": "--", "lw": 1.2, "zorder": 2}
+            found[name] = line | {"label": label(name)}
+        else:
+            found[name] = {"color": _GREY, "lw": 0.6, "zorder": 1, "label": OTHERS}
+    return found
+
+
+def _cycle(colors: tuple[str, ...], count: int) -> list[str]:
+    return [colors[i % len(colors)] for i in range(count)]
+
+
+def _draw_band(axes: Axes, rows: list[Row], style: Style) -> None:
+    """A line, and its interval where it has a colour of its own."""
     rows = [row for row in rows if row["value"] is not None]
     if not rows:
         return
     h = [row["h"] for row in rows]
-    (line,) = axes.plot(
-        h, [row["value"] for row in rows], "o-", ms=3, label=label(name), color=_color(name, scores)
-    )
-    if rows[0]["low"] is not None:
+    axes.plot(h, [row["value"] for row in rows], **style)
+    if "marker" in style and rows[0]["low"] is not None:
         low, high = ([row[end] for row in rows] for end in ("low", "high"))
-        axes.fill_between(h, low, high, alpha=0.15, color=line.get_color(), linewidth=0)
+        axes.fill_between(h, low, high, alpha=0.15, color=style["color"], linewidth=0)
 
 
-def _color(name: str, scores: dict[str, Any]) -> str | None:
-    return _FLOOR if scores["floor"] else COLORS.get(name)
+def _name_those_below(axes: Axes) -> None:
+    """Lines with a colour that are cut off as a whole."""
+    heights = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.get_lines()}
+    below = [text for text, y in heights.items() if text != OTHERS and y.max() < _LOWEST]
+    if below:
+        text = f"further down: {', '.join(below)}"
+        axes.text(0.02, 0.02, text, transform=axes.transAxes, fontsize=8)
 
 
-def _style(axes: Axes, x: str, y: str) -> None:
+def _label(axes: Axes, x: str, y: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(fig: Figure, axes: Axes) -> None:
-    fig.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+def _legend(fig: Figure) -> None:
+    """One entry for each label of any panel; those without a colour come last."""
+    entries = {
+        text: handle
+        for axes in fig.axes
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if OTHERS in entries:
+        entries[OTHERS] = entries.pop(OTHERS)
+    fig.legend(
+        list(entries.values()), list(entries), loc="outside lower center", ncols=5, fontsize=8
+    )
 
 
 def svg(fig: Figure) -> str:
@@ -133,4 +207,4 @@ def svg(fig: Figure) -> str:
     return buffer.getvalue().split("?>", 1)[-1]
 
 
-__all__ = ["figures", "svg"]
+__all__ = ["figures", "file_name", "styles", "svg", "titles"]

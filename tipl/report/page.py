@@ -7,16 +7,16 @@ from typing import Any
 
 import jinja2
 
-from tipl.report.figures import figures, svg
-from tipl.report.tables import cell, headline, label, tables, verdict
+from tipl.report.figures import figures, file_name, svg
+from tipl.report.tables import cell, headline, label, tables
+from tipl.report.verdict import verdict
 
 
 def write_report(results: dict[str, Any], out: Path) -> Path:
     """Write the page and the figures beside ``results.json``; returns the page's path."""
     drawn = figures(results)
     for title, figure in drawn.items():
-        name = title.lower().replace("'", "").replace(",", "").replace(" ", "-")
-        figure.savefig(out / f"{name}.png", dpi=150)
+        figure.savefig(out / file_name(title), dpi=150)
     loader = jinja2.PackageLoader("tipl", "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     page = environment.get_template("report.html").render(

@@ -1,0 +1,279 @@
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import weighttraj as wt
+from tipl.baselines import Ema
+from tipl.baselines.trajectory import Trajectory
+from tipl.checks import TOLERANCE, causality, equivariance, run_like, scale, skills
+from tipl.errors import ForecastError, ModelError, TrainError
+from tipl.gate import Gate, GateTrainConfig, train_gate
+from tipl.gate import train as training
+from tipl.gate.examples import PARAMS, gather
+from tipl.gate.features import Clock, Structure, features
+from tipl.gate.forecaster import GateModelConfig
+from tipl.gate.history import History, histories
+from tipl.gate.train import relative_error
+from tipl.models.gate import GateConfig, GateNetwork
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+
+HORIZONS = (1, 2, 5)
+SIZES = GateConfig(horizons=HORIZONS, phases=4, width=16, experts=3)
+
+
+@pytest.fixture(scope="module")
+def runs(small_dataset: Path) -> list[wt.Run]:
+    return wt.open(small_dataset).split("train").runs
+
+
+@pytest.fixture(scope="module")
+def config(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> GateTrainConfig:
+    return GateTrainConfig(
+        data=(small_dataset,),
+        out=tmp_path_factory.mktemp("gate") / "model",
+        horizons=HORIZONS,
+        starts=40,
+        n_batches=60,
+        batch_size=8,
+        validate_every=20,
+        width=SIZES.width,
+        experts=SIZES.experts,
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(config: GateTrainConfig) -> Gate:
+    return train_gate(config)
+
+
+def unseen(config: GateTrainConfig) -> wt.Run:
+    return wt.open_dataset(config.data[0]).split("test").runs[0]
+
+
+def lively(seed: int = 0) -> Gate:
+    """A network whose forecasts are no copies, as all its parameters are drawn."""
+    torch.manual_seed(seed)
+    network = GateNetwork(SIZES)
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    return Gate(network, GateModelConfig(network=SIZES, every=2))
+
+
+# History and features
+
+
+def test_history_is_what_it_says(runs: list[wt.Run]) -> None:
+    weights = runs[0].weights[:31].astype(np.float64)
+    steps = np.diff(weights, axis=0)
+    (_, history), *_ = list(histories(runs[0], [30], 20, (0.5, 0.9)))
+    np.testing.assert_allclose(history.steps, steps[::-1][:20], atol=1e-7)
+    np.testing.assert_allclose(history.drift, steps.mean(0), atol=1e-7)
+    ema = Ema(0.9)(Trajectory.of(runs[0]), [30])
+    np.testing.assert_allclose(history.averages[1], next(ema)[2][0], atol=1e-7)
+    powers = 0.95 ** np.arange(30)[::-1]
+    squares = (powers[:, None] * steps**2).sum(0) / powers.sum()
+    np.testing.assert_allclose(history.squares, squares, rtol=1e-4, atol=1e-12)
+
+
+def test_a_walk_that_goes_on_is_the_walk_from_the_beginning(runs: list[wt.Run]) -> None:
+    alone = [h.averages.clone() for _, h in histories(runs[0], [40], 20, (0.9,))]
+    list(histories(runs[0], [3, 20], 20, (0.9,)))
+    further = [h.averages.clone() for _, h in histories(runs[0], [40], 20, (0.9,))]
+    assert torch.equal(alone[0], further[0])
+    places = [place for place, _ in histories(runs[0], [30, 2, 2, 7], 20, (0.9,))]
+    assert places == [1, 2, 3, 0]
+
+
+def test_features_of_a_run_that_has_not_moved_are_finite(runs: list[wt.Run]) -> None:
+    structure, clock = Structure.of(runs[0].layout), Clock.of(runs[0])
+    history = History(runs[0].weights[0], SIZES.lags, SIZES.betas)
+    for _ in range(2):
+        seen = features(history, structure, clock, SIZES)
+        assert seen.inputs.shape == (122, SIZES.inputs)
+        assert seen.contexts.shape == (7, SIZES.contexts)
+        assert torch.isfinite(seen.inputs).all()
+        assert torch.isfinite(seen.contexts).all()
+        history.push(runs[0].weights[0])
+
+
+def test_the_structure_knows_rows_columns_and_kinds(runs: list[wt.Run]) -> None:
+    layout = runs[0].layout
+    structure = Structure.of(layout)
+    part = layout["mlp_extractor.policy_net.2.weight"].slice
+    rows = structure.row[part].view(8, 8)
+    columns = structure.column[part].view(8, 8)
+    assert (rows == rows[:, :1]).all()
+    assert (columns == columns[:1]).all()
+    assert len(structure.row.unique()) == sum(p.shape[0] for p in layout.params)
+    assert structure.kind.tolist() == [5, 0, 3, 1, 3, 2, 4]
+
+
+# Network
+
+
+def test_before_training_it_is_persistence(runs: list[wt.Run]) -> None:
+    gate = Gate(GateNetwork(SIZES), GateModelConfig(network=SIZES, every=2))
+    forecast = gate.forecast(runs[0], [0, 20], [1, 5])
+    assert np.array_equal(forecast, np.repeat(runs[0].weights[[0, 20]][:, None], 2, axis=1))
+
+
+def test_one_tensor_after_the_other_is_the_whole(runs: list[wt.Run]) -> None:
+    gate, structure, clock = lively(), Structure.of(runs[0].layout), Clock.of(runs[0])
+    for _, history in histories(runs[0], [17], SIZES.lags, SIZES.betas):
+        seen = features(history, structure, clock, SIZES)
+    with torch.no_grad():
+        whole = gate.network(seen.inputs, seen.contexts, seen.basis, structure.tensor)
+        parts = gate.displacements(seen, structure, [2, 0])
+    assert whole.abs().max() > 1e-4
+    torch.testing.assert_close(parts, whole.T[[2, 0]], rtol=1e-4, atol=1e-8)
+
+
+# The tests of a causal forecaster; that on random walks is among the checks of all models.
+
+
+def test_it_is_causal(runs: list[wt.Run], tmp_path: Path) -> None:
+    assert causality(lively(), runs[0], tmp_path, 20, HORIZONS)
+
+
+@pytest.mark.parametrize("symmetry", ["permutation", "sign"])
+def test_it_follows_symmetries(symmetry: str, runs: list[wt.Run], tmp_path: Path) -> None:
+    error = equivariance(lively(), runs[0], tmp_path, [9, 40], HORIZONS, symmetry=symmetry)
+    assert error < TOLERANCE
+
+
+def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
+    assert scale(lively(), runs[0], tmp_path, [9, 40], HORIZONS) < TOLERANCE
+
+
+def test_one_network_serves_policies_of_any_size(tmp_path: Path) -> None:
+    layout = wt.ParamLayout.of(
+        {
+            "in": ((6, 3), "weight", ("hidden_0", "observation")),
+            "out": ((2, 6), "weight", ("action", "hidden_0")),
+        }
+    )
+    info = wt.RunInfo(run_id="wide", layout=layout, block=8)
+    with wt.RunWriter(tmp_path / "wide.zarr", info) as writer:
+        rng = np.random.default_rng(0)
+        for t in range(20):
+            writer.append(rng.normal(size=30).astype(np.float32), num_timesteps=t)
+    gate = replace(lively(), config=GateModelConfig(network=SIZES, every=None))
+    forecast = gate.forecast(wt.open_run(tmp_path / "wide.zarr"), [0, 9], HORIZONS)
+    assert forecast.shape == (2, 3, 30)
+
+
+# Training
+
+
+def test_examples_are_what_forecasts_see(runs: list[wt.Run]) -> None:
+    examples = gather([runs], SIZES, starts=2000, seed=0)  # so many draws find every start
+    assert len(examples) == sum(len(run) - 2 for run in runs)
+    assert examples.inputs.shape[1:] == (PARAMS, SIZES.inputs)
+    assert examples.weight.sum(1).numpy() == pytest.approx(np.ones(len(examples)), rel=1e-3)
+    gate = lively()
+    skill = 1 - relative_error(gate.network, examples).item()
+    # The same of the forecasts.
+    ratios = []
+    for run in runs:
+        weights = run.weights[:]
+        for t in range(1, len(run) - 1):
+            for h in (h for h in HORIZONS if t + h < len(run)):
+                error = gate.forecast(run, [t], [h])[0, 0] - weights[t + h]
+                ratios.append((error**2).sum() / ((weights[t + h] - weights[t]) ** 2).sum())
+    assert skill == pytest.approx(1 - np.mean(ratios), abs=1e-3)
+
+
+def test_it_learns(trained: Gate, config: GateTrainConfig) -> None:
+    lines = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
+    assert [line["batch"] for line in lines] == [0, 20, 40, 60]
+    assert lines[-1]["error"] < 0.95
+    assert (skills(trained, [unseen(config)], HORIZONS) > 0.05).all()
+
+
+def test_an_interrupted_training_ends_as_an_undisturbed_one(
+    trained: Gate, config: GateTrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = training._Training._step
+
+    def stopped(self: Any, network: Any, optimizer: Any, examples: Any, n: int) -> float:
+        if n == 33:
+            raise KeyboardInterrupt
+        return step(self, network, optimizer, examples, n)
+
+    settings = replace(config, out=tmp_path / "model")
+    with monkeypatch.context() as patch:
+        patch.setattr(training._Training, "_step", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            train_gate(settings)
+    again = train_gate(settings)
+    for name, tensor in trained.network.state_dict().items():
+        assert torch.equal(tensor, again.network.state_dict()[name]), name
+    log = (settings.out / "log.jsonl").read_text()
+    assert log == (config.out / "log.jsonl").read_text()
+
+
+def test_validation_keeps_the_best_state(
+    small_dataset: Path, config: GateTrainConfig, tmp_path: Path
+) -> None:
+    """Where nothing can be learnt, persistence stays."""
+    data = tmp_path / "data"
+    shutil.copytree(small_dataset, data)
+    info = read_dataset_info(data)
+    entries = [replace(run, split="validation") if run.seed == 2 else run for run in info.runs]
+    write_dataset_info(data, replace(info, runs=tuple(entries)))
+    settings = replace(
+        config, data=(data,), out=tmp_path / "model", n_batches=4, validate_every=2,
+        learning_rate=30.0,
+    )  # fmt: skip
+    model = train_gate(settings)
+    assert not model.network.experts.any()
+    lines = [json.loads(line) for line in (settings.out / "log.jsonl").read_text().splitlines()]
+    assert lines[0]["validation_error"] == pytest.approx(1, abs=1e-4)
+    assert min(line["validation_error"] for line in lines[1:]) > 1
+
+
+def test_it_is_saved_and_loaded(trained: Gate, config: GateTrainConfig, tmp_path: Path) -> None:
+    trained.save(tmp_path / "copy")
+    again = Gate.load(tmp_path / "copy")
+    assert again.name == "copy"
+    request = (unseen(config), [3, 30], [5, 1])
+    assert np.array_equal(again.forecast(*request), trained.forecast(*request))
+    (tmp_path / "copy/model.safetensors").write_bytes(b"damaged")
+    with pytest.raises(ModelError, match="cannot be loaded"):
+        Gate.load(tmp_path / "copy")
+
+
+def test_what_it_was_not_trained_for_is_refused(trained: Gate, config: GateTrainConfig) -> None:
+    run = unseen(config)
+    with pytest.raises(ForecastError, match=r"\[3\]"):
+        trained.forecast(run, [5], [3])
+    other = replace(trained, config=replace(trained.config, every=64))
+    with pytest.raises(ModelError, match="every 64 gradient steps"):
+        other.forecast(run, [5], [1])
+
+
+def test_runs_that_are_too_short_are_refused(config: GateTrainConfig, tmp_path: Path) -> None:
+    settings = replace(config, out=tmp_path, horizons=(1, 100))
+    with pytest.raises(TrainError, match="runs of more than 102 snapshots"):
+        train_gate(settings)
+
+
+def test_other_settings_are_refused(trained: Gate, config: GateTrainConfig) -> None:
+    with pytest.raises(TrainError, match="other settings"):
+        train_gate(replace(config, n_batches=61))
+    assert train_gate(config).config == trained.config
+
+
+def test_run_like_keeps_what_the_clock_reads(runs: list[wt.Run], tmp_path: Path) -> None:
+    made = run_like(runs[0], runs[0].weights[:20], tmp_path)
+    ours, theirs = Clock.of(made), Clock.of(runs[0])
+    assert np.array_equal(ours.phase, theirs.phase[:20])
+    np.testing.assert_allclose(ours.rate, theirs.rate[:20])

@@ -1,0 +1,224 @@
+"""Results as words, pictures and places in Markdown pages."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tipl.errors import EvaluateError
+from tipl.report import insert_markdown
+from tipl.report.figures import OTHERS, figures, skill_figure, styles, titles
+from tipl.report.markdown import places, render, rewrite
+from tipl.report.scores import that_matter
+from tipl.report.tables import cell, tables
+from tipl.report.verdict import paragraphs, verdict
+
+ROOT = Path(__file__).parents[2]
+DEMO = Path("datasets/demo/results.json")
+SECTIONS = ("overview", "verdict", "tables", "figures", "source")
+
+
+@pytest.fixture
+def demo() -> dict[str, Any]:
+    """Results of a released data set, as an earlier version wrote them."""
+    document: dict[str, Any] = json.loads((ROOT / DEMO).read_text())
+    return document
+
+
+def shifted(found: Any, by: float) -> Any:
+    """All figures of a forecaster, so much larger, with intervals of 0.02."""
+    if isinstance(found, list):
+        return [shifted(each, by) for each in found]
+    if not isinstance(found, dict):
+        return found
+    if "h" not in found:
+        return {key: shifted(each, by) for key, each in found.items()}
+    value = (found["value"] or 0) + by
+    return found | {"value": value, "low": value - 0.01, "high": value + 0.01}
+
+
+@pytest.fixture
+def many(demo: dict[str, Any]) -> dict[str, Any]:
+    """Twenty more forecasters: baseline n has skill n / 100; one model has 0.5."""
+    forecasters = demo["forecasters"]
+    copy = {key: forecasters["persistence"][key] for key in ("wpe", "repw", "scatter")}
+    for number in range(20):
+        moved = shifted({"skill": forecasters["persistence"]["skill"]}, number / 100)
+        gain = shifted({"gain": forecasters["persistence"]["gain"]}, -number / 100)
+        forecasters[f"base-{number}"] = {"causal": True, "floor": False} | copy | moved | gain
+    forecasters["tipl-2"] = shifted(forecasters["persistence"], 0.5)
+    ratio = {"value": 0.5, "low": 0.4, "high": 0.6}
+    forecasters["tipl-2"]["repw_ratio"] = dict.fromkeys(demo["modes"], ratio)
+    return demo
+
+
+# Who matters
+
+
+def test_models_the_copy_and_the_best_baselines_matter(many: dict[str, Any]) -> None:
+    best = ["base-19", "base-18", "base-17", "base-0"]  # three by skill, one by gain
+    assert that_matter(many) == ["tipl", "tipl-2", "persistence", *best]
+
+
+def test_the_others_are_grey_and_share_an_entry(many: dict[str, Any]) -> None:
+    drawn = styles(many)
+    coloured = {name: style["color"] for name, style in drawn.items() if "marker" in style}
+    assert set(coloured) == set(that_matter(many))
+    assert len(set(coloured.values())) == len(coloured)
+    assert drawn["reconstruction-32"]["ls"] == "--"
+    assert {drawn[f"base-{n}"]["label"] for n in range(1, 17)} == {OTHERS}
+    (legend,) = skill_figure(many).legends
+    said = [text.get_text() for text in legend.get_texts()]
+    named = [name for name in said if name.startswith("base-")]
+    assert sorted(named) == ["base-0", "base-17", "base-18", "base-19"]
+    assert {*said} - {*named} == {"TIPL", "tipl-2", "copy", "floor, rank 32", OTHERS}
+    assert len(said) == 9
+
+
+def test_a_line_below_the_frame_is_named(demo: dict[str, Any]) -> None:
+    (text,) = skill_figure(demo).axes[0].texts
+    assert text.get_text() == "further down: TIPL"
+
+
+def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
+    assert titles(demo) == list(figures(demo))
+    assert len(titles(demo)) == 4
+    assert titles(demo | {"modes": []}) == ["Skill against horizon"]
+
+
+# The verdict
+
+
+def test_the_verdict_answers_in_weights_in_return_and_in_gain(many: dict[str, Any]) -> None:
+    first, second, rivals = paragraphs(many)
+    assert first.startswith("In weight error, TIPL loses to copying the last weights on 10 runs")
+    assert "-910 [-941, -883] at h = 10" in first
+    assert "-0.07 [-0.13, 0.00] at h = 50" in first
+    assert "tipl-2 beats copying the last weights on 10 runs that it was not trained on" in second
+    assert "0.50 [0.49, 0.51] at h = 200" in second
+    assert "0.50 [0.40, 0.60] times the copy's with sampled actions (better)" in second
+    assert rivals == (
+        "Best of 20 baselines: in weight error at h = 1, base-19, 0.19 [0.18, 0.20]; "
+        "in weight error at h = 10, base-19, 0.19 [0.18, 0.20]; "
+        "in inference gain at h = 50, base-0, 0.00 [-0.01, 0.01]."
+    )
+
+
+def test_an_old_file_has_the_ratio_without_an_interval(demo: dict[str, Any]) -> None:
+    sums = [
+        sum(row["value"] for row in scores["repw"]["sampled"]["learning"] if row["h"] <= 10)
+        for name, scores in demo["forecasters"].items()
+        if name in ("tipl", "persistence")
+    ]
+    assert f"is {sums[1] / sums[0]:.3g} times the copy's with sampled actions," in verdict(demo)
+
+
+def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> None:
+    for scores in demo["forecasters"].values():
+        for key in ("repw", "gain", "scatter"):
+            del scores[key]
+    demo["modes"], demo["split"] = [], "train"
+    (said,) = paragraphs(demo)
+    assert "on 10 runs that it may have been trained on" in said
+    assert said.endswith("-42.06 [-43.83, -40.52] at h = 200.")
+
+
+def test_split_verdicts_say_where(many: dict[str, Any]) -> None:
+    rows = many["forecasters"]["tipl-2"]["skill"]["ratio_of_sums"]["all"]
+    rows[0] |= {"value": -0.3, "low": -0.4, "high": -0.2}
+    said = paragraphs(many)[1]
+    assert "tipl-2 splits with copying" in said
+    assert said.split(" It is ")[1].startswith("better at h = 2, 3,")
+    assert "100, 200, worse at h = 1. In return" in said
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(0.123, "0.12"), (12.345, "12.35"), (-123.4, "-123"), (-22134.0, "-22100"), (None, "-")],
+)
+def test_numbers_have_three_digits(value: float | None, said: str) -> None:
+    assert cell({"value": value, "low": None, "high": None}) == said
+
+
+# Places
+
+
+def page_of(*sections: str, source: Path = DEMO) -> str:
+    return "# A page\n\nProse.\n" + "".join(
+        f"\n<!-- results of {source}, {section}: rewrite -->\n<!-- end of results -->\n\nMore.\n"
+        for section in sections
+    )
+
+
+def test_every_section_is_written_in_its_place(demo: dict[str, Any], tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    other = page_of("verdict", source=Path("other.json"))
+    page.write_text(page_of(*SECTIONS) + other)
+    assert all(place.empty for place in places(page.read_text()))
+    insert_markdown(demo, DEMO, page)
+    text = page.read_text()
+    assert text.endswith(other)
+    assert [place.section for place in places(text) if not place.empty] == list(SECTIONS)
+    assert text.startswith("# A page\n\nProse.\n")
+    assert text.count("\nMore.\n") == len(SECTIONS) + 1
+    pictures = sorted(path.name for path in (tmp_path / "results").iterdir())
+    assert len(pictures) == 4
+    assert all(f"](results/{name})" in text for name in pictures)
+    assert rewrite(text, "results", str(DEMO), partial(render, demo, DEMO)) == text
+    changed = demo | {"command": "tipl evaluate something else"}
+    again = rewrite(text, "results", str(DEMO), partial(render, changed, DEMO))
+    assert again == text.replace(demo["command"], changed["command"]) != text
+
+
+def test_without_a_section_it_is_the_overview(demo: dict[str, Any]) -> None:
+    bare = f"<!-- results of {DEMO} -->\n<!-- end of results -->\n"
+    text = rewrite(bare, "results", str(DEMO), lambda section: render(demo, DEMO, section))
+    assert "| TIPL | -22100 [-23200, -21100] |" in text
+    assert verdict(demo) in text
+
+
+def test_important_tables_are_open_and_the_others_folded(demo: dict[str, Any]) -> None:
+    text = render(demo, DEMO, "tables")
+    main = [table.title for table in tables(demo) if table.main]
+    assert main == [
+        "Skill: ratio of sums, all starts",
+        "Function skill: divergence of policies",
+        "Inference gain, sampled actions, log_std of the start",
+    ]
+    before, _, folded = text.partition("<details>")
+    assert all(f"**{title}**" in before for title in main)
+    assert "Skill: mean of the ratios" in folded
+    assert text.count("<summary>") == len(tables(demo)) - len(main)
+    assert "future of the run: TIPL, floor, rank 32." in folded
+
+
+def test_the_source_says_how_it_was_judged(demo: dict[str, Any]) -> None:
+    text = render(demo, DEMO, "source")
+    for said in (
+        "version 1; 10 runs of its test split: seed0040",
+        "3,000 for weights",
+        "5 episodes",
+    ):
+        assert said in text
+    assert f"`{demo['command']}`" in text
+
+
+def test_a_page_without_a_place_is_refused(demo: dict[str, Any], tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    unclosed = f"<!-- results of {DEMO} -->\n"
+    for text in ("# Nothing\n", page_of("verdict", source=Path("other.json")), unclosed):
+        page.write_text(text)
+        with pytest.raises(EvaluateError, match="no place for these results"):
+            insert_markdown(demo, DEMO, page)
+        assert page.read_text() == text
+
+
+def test_an_unknown_section_is_refused(demo: dict[str, Any], tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(page_of("poem"))
+    with pytest.raises(EvaluateError, match=r"no such section of results(.|\n)*overview, verdict"):
+        insert_markdown(demo, DEMO, page)

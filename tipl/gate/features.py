@@ -1,0 +1,215 @@
+"""From the history of a policy's weights to what the network sees.
+
+Everything is relative: steps are divided by the local scale of their tensor, and parameters are
+turned so that an average of their steps is positive. So the numbers are the same for a policy with
+other signs or another order of its hidden units, or with steps twice as long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import one_hot, softsign
+
+from tipl.gate.history import History
+from tipl.models.gate import KINDS, LAG_COSINES, GateConfig
+from weighttraj import ParamLayout, Run
+
+TINY = 1e-30
+"""Added to squares, so that what does not move is divided by something."""
+_REFERENCE = 2
+"""The average whose sign turns a parameter: beta 0.9."""
+_NEAR, _FAR = 1, 3
+"""A short average is compared with all from this one on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure:
+    """Which parameters belong together."""
+
+    tensor: Int[Tensor, " param"]
+    """Tensor of each parameter."""
+    row: Int[Tensor, " param"]
+    """Row of its tensor, counted over all tensors; of a vector, each element."""
+    column: Int[Tensor, " param"]
+    """The same of columns."""
+    kind: Int[Tensor, " tensor"]
+    """Place in ``KINDS``."""
+    slices: tuple[slice, ...]
+    """Parameters of each tensor."""
+
+    @classmethod
+    def of(cls, layout: ParamLayout) -> Structure:
+        """Of a policy's layout."""
+        size = layout.size
+        tensor, row, column = (np.zeros(size, np.int64) for _ in range(3))
+        rows = columns = 0
+        for number, param in enumerate(layout.params):
+            tensor[param.slice] = number
+            shape = param.shape if len(param.shape) == 2 else (param.size, 1)
+            i, j = (place.ravel() for place in np.indices(shape))
+            is_matrix = len(param.shape) == 2
+            row[param.slice] = rows + i
+            column[param.slice] = columns + (j if is_matrix else i)
+            rows, columns = rows + shape[0], columns + (shape[1] if is_matrix else shape[0])
+        return cls(
+            tensor=torch.from_numpy(tensor),
+            row=torch.from_numpy(row),
+            column=torch.from_numpy(column),
+            kind=torch.tensor([_kind(param.role, param.axes) for param in layout.params]),
+            slices=tuple(param.slice for param in layout.params),
+        )
+
+    def means(self, values: Float[Tensor, "any param"]) -> Float[Tensor, "any tensor"]:
+        """Means over the parameters of each tensor."""
+        return torch.stack([values[:, part].mean(1) for part in self.slices], dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock:
+    """What is known of each snapshot's time."""
+
+    phase: Int[np.ndarray, " time"]
+    """Part of its iteration that ends at a snapshot; -1: none."""
+    rate: Float[np.ndarray, " time"]
+    """Learning rate over the first one; 1 where it is not known."""
+
+    @classmethod
+    def of(cls, run: Run) -> Clock:
+        """Of a run."""
+        rates = np.asarray(run.learning_rate, np.float64)
+        known = rates[np.isfinite(rates)]
+        first = known[0] if len(known) else 1.0
+        return cls(phase=np.asarray(run.phase), rate=np.nan_to_num(rates / first, nan=1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features:
+    """What the network sees of one start."""
+
+    inputs: Float[Tensor, "param input"]
+    """Of each parameter."""
+    contexts: Float[Tensor, "tensor context"]
+    """Of each tensor."""
+    basis: Float[Tensor, "param basis"]
+    """Steps, averages and drift, as they are."""
+
+
+def features(history: History, structure: Structure, clock: Clock, config: GateConfig) -> Features:
+    """What the network sees at the snapshot where the history ends."""
+    t, steps, averages, drift = history.t, history.steps, history.averages, history.drift
+    squares = history.squares
+    basis = torch.cat([steps, averages, drift[None]])
+    own = structure.means(squares[None])[0]  # (tensor,)
+    everyone = squares.mean()
+    scale = (own + TINY).sqrt()[structure.tensor]
+    turn = torch.sign(averages[_REFERENCE]) / scale
+    inputs = basis * turn
+    inputs[-1] *= max(t, 1) ** 0.5  # a random walk's drift falls with the root of time
+    sizes = torch.stack(
+        [squares, *(_shared(squares, place) for place in (structure.row, structure.column))]
+    )
+    inputs = torch.cat([inputs, _log_ratio(sizes, scale**2)])
+    tensors = _course(steps, averages, drift, own, t, structure.means)
+    policy = _course(steps, averages, drift, everyone[None], t, lambda x: x.mean(1, keepdim=True))
+    time = _time(clock, t, config.phases)
+    count = len(own)
+    contexts = torch.cat(
+        [
+            tensors.T,
+            policy.T.expand(count, -1),
+            _log_ratio(own, everyone)[:, None],
+            one_hot(structure.kind, len(KINDS)).float(),
+            time.expand(count, -1),
+        ],
+        dim=1,
+    )
+    return Features(inputs=softsign(inputs).T, contexts=contexts, basis=basis.T)
+
+
+Means = Callable[[Float[Tensor, "any param"]], Float[Tensor, "any group"]]
+
+
+def _course(
+    steps: Float[Tensor, "lag param"],
+    averages: Float[Tensor, "beta param"],
+    drift: Float[Tensor, " param"],
+    scale: Float[Tensor, " group"],
+    t: int,
+    means: Means,
+) -> Float[Tensor, "number group"]:
+    """How straight a group of parameters goes: cosines between its steps and averages; and sizes.
+
+    Args:
+        steps: the last ones.
+        averages: of all.
+        drift: mean step since phi_0.
+        scale: mean squared step of each group.
+        t: number of the snapshot.
+        means: over the parameters of each group.
+    """
+    last, earlier = steps[:1], steps[1 : 1 + LAG_COSINES]
+    missing = LAG_COSINES - len(earlier)
+    if missing:
+        earlier = torch.cat([earlier, torch.zeros(missing, steps.shape[1])])
+    near, far = averages[_NEAR : _NEAR + 1], averages[_FAR:]
+    squared_averages, squared_drift = means(averages**2), means(drift[None] ** 2)
+    squared_last = means(last**2)
+
+    def cosine(product: Tensor, one: Tensor, other: Tensor) -> Tensor:
+        return product / ((one + TINY).sqrt() * (other + TINY).sqrt())
+
+    return torch.cat(
+        [
+            cosine(means(last * earlier), squared_last, means(earlier**2)),
+            cosine(means(last * averages), squared_last, squared_averages),
+            cosine(
+                means(near * far),
+                squared_averages[_NEAR : _NEAR + 1],
+                squared_averages[_FAR:],
+            ),
+            cosine(means(averages * drift), squared_averages, squared_drift),
+            _log_ratio(squared_averages, scale),
+            _log_ratio(squared_last, scale),
+            _log_ratio(squared_drift * max(t, 1), scale),
+        ]
+    )
+
+
+def _time(clock: Clock, t: int, phases: int) -> Float[Tensor, " number"]:
+    phase = one_hot(torch.tensor(int(clock.phase[t]) + 1), phases + 1).float()
+    rate = float(clock.rate[t])
+    rest = torch.tensor([np.log1p(t) / 4, rate, np.log(rate + 1e-3) / 3], dtype=torch.float32)
+    return torch.cat([phase, rest])
+
+
+def _log_ratio(squared: Tensor, scale: Tensor) -> Tensor:
+    """Logarithm of a size relative to a scale; both are squared."""
+    return (0.5 * torch.log((squared + TINY) / (scale + TINY))).clamp(-8, 8)
+
+
+def _shared(
+    values: Float[Tensor, " param"], place: Int[Tensor, " param"]
+) -> Float[Tensor, " param"]:
+    """For each parameter the mean over those that share its place."""
+    return (torch.bincount(place, values) / torch.bincount(place))[place].to(values.dtype)
+
+
+def _kind(role: str, axes: tuple[str, ...]) -> int:
+    names = {
+        ("weight", "input"): "input weight",
+        ("weight", "hidden"): "hidden weight",
+        ("weight", "output"): "output weight",
+        ("bias", "hidden"): "hidden bias",
+        ("bias", "output"): "output bias",
+    }
+    place = "output" if "action" in axes else "input" if "observation" in axes else "hidden"
+    return KINDS.index(names.get((role, place), "other"))
+
+
+__all__ = ["Clock", "Features", "Structure", "features"]

@@ -1,0 +1,136 @@
+"""The trained network as a forecaster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from tipl.baselines.files import ARRAYS, broken, read_config, write
+from tipl.baselines.horizons import rows_of
+from tipl.errors import ModelError
+from tipl.forecast import check_request
+from tipl.gate.features import Clock, Features, Structure, features
+from tipl.gate.history import histories
+from tipl.models.gate import GateConfig, GateNetwork
+from weighttraj import Run
+from weighttraj.threads import one_torch_thread
+
+ROWS = 4096
+"""Parameters that go through the network at a time: their activations stay in the cache."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateModelConfig:
+    """What a saved one says of itself."""
+
+    network: GateConfig
+    """Sizes of the network."""
+    every: int | None
+    """Gradient steps from one snapshot to the next in the training runs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """tipl-gate: phi_t and a mixture of linear filters on each parameter's own past.
+
+    One file serves policies of any size. A forecast from t has seen phi_0, ..., phi_t, the phase
+    and the learning rate of each, and nothing else.
+    """
+
+    network: GateNetwork
+    """The network."""
+    config: GateModelConfig
+    """Its sizes, and the cadence that it is for."""
+    name: str = "tipl-gate"
+    """Name in tables and figures: of the folder that it was loaded from."""
+    kind = "gate"
+    causal = True
+
+    @torch.no_grad()
+    def forecast(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Float32[np.ndarray, "start horizon param"]:
+        """phi_t and what the network adds to it.
+
+        Raises:
+            ForecastError: it was not trained for such a horizon.
+            ModelError: the run has another cadence, or longer iterations.
+        """
+        check_request(run, starts, horizons)
+        sizes = self.config.network
+        rows = rows_of(sizes.horizons, horizons, self.name)
+        structure, clock = Structure.of(run.layout), Clock.of(run)
+        self._check(run, clock)
+        out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
+        self.network.eval()
+        with one_torch_thread():
+            for place, history in histories(run, starts, sizes.lags, sizes.betas):
+                seen = features(history, structure, clock, sizes)
+                moved = self.displacements(seen, structure, rows)
+                out[place] = (history.weights + moved).numpy()
+        return out
+
+    def displacements(
+        self, seen: Features, structure: Structure, rows: list[int]
+    ) -> Float[Tensor, "horizon param"]:
+        """What is added to the weights.
+
+        Args:
+            seen: at the start.
+            structure: of the policy.
+            rows: places of the wanted horizons among those of the network.
+        """
+        parts = []
+        for number, part in enumerate(structure.slices):
+            for first in range(part.start, part.stop, ROWS):
+                some = slice(first, min(first + ROWS, part.stop))
+                moved = self.network.of_one_tensor(
+                    seen.inputs[some], seen.contexts[number], seen.basis[some], rows
+                )
+                parts.append(moved)
+        return torch.cat(parts).T
+
+    def _check(self, run: Run, clock: Clock) -> None:
+        every = run.info.cadence.every if run.info.cadence else None
+        phases = int(clock.phase.max()) + 1
+        if every != self.config.every or phases > self.config.network.phases:
+            raise ModelError(
+                "the model was trained on snapshots of another cadence",
+                expected=f"a snapshot every {self.config.every} gradient steps, at most "
+                f"{self.config.network.phases} in an iteration",
+                got=f"every {every}, {phases} in an iteration",
+                where=run.path,
+                do="train a model on runs of this cadence",
+            )
+
+    def save(self, path: str | Path) -> None:
+        """Write config.json and model.safetensors."""
+        write(path, {"kind": self.kind, **asdict(self.config)})
+        save_file(self.network.state_dict(), Path(path) / ARRAYS)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Gate:
+        """Read a saved one; every parameter must be there.
+
+        Raises:
+            FileNotFoundError: there is no forecaster in the folder.
+            ModelError: the files are another's, or damaged.
+        """
+        config = read_config(path, cls.kind, GateModelConfig)
+        try:
+            network = GateNetwork(config.network)
+            network.load_state_dict(load_file(Path(path) / ARRAYS), strict=True)
+        except (SafetensorError, RuntimeError) as error:
+            raise broken(path, error) from error
+        return cls(network, config, Path(path).resolve().name)
+
+
+__all__ = ["Gate", "GateModelConfig"]

@@ -1,0 +1,105 @@
+"""The past of a run, a snapshot at a time: what a forecast needs of it fits into little memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from tipl.baselines.trajectory import Reader
+from weighttraj import Run
+
+SQUARES_BETA = 0.95
+"""Of the average of squared steps, the local scale."""
+
+
+class History:
+    """Steps of all parameters up to a snapshot, and averages of them.
+
+    Bias-corrected as Adam's: a run on a straight line has that line's step in every average.
+
+    Args:
+        first: phi_0.
+        lags: steps that are kept.
+        betas: of the averages.
+    """
+
+    def __init__(
+        self, first: Float32[np.ndarray, " param"], lags: int, betas: Sequence[float]
+    ) -> None:
+        self.t = 0
+        """Snapshots that followed the first."""
+        self._first = self._last = torch.from_numpy(np.array(first))
+        self._steps = torch.zeros(lags, len(first))  # a ring; the newest is at t % lags
+        self._betas = torch.tensor(betas)[:, None]
+        self._averages = torch.zeros(len(betas), len(first))
+        self._squares = torch.zeros(len(first))
+
+    def push(self, weights: Float32[np.ndarray, " param"]) -> None:
+        """Go on to the next snapshot."""
+        now = torch.from_numpy(np.array(weights))
+        step = now - self._last
+        self.t, self._last = self.t + 1, now
+        self._steps[self.t % len(self._steps)] = step
+        self._averages.mul_(self._betas).add_((1 - self._betas) * step)
+        self._squares.mul_(SQUARES_BETA).addcmul_(step, step, value=1 - SQUARES_BETA)
+
+    @property
+    def weights(self) -> Float[Tensor, " param"]:
+        """phi_t."""
+        return self._last
+
+    @property
+    def steps(self) -> Float[Tensor, "lag param"]:
+        """The last steps, newest first; 0 before the beginning of the run."""
+        count = len(self._steps)
+        return self._steps[(self.t - torch.arange(count)) % count]
+
+    @property
+    def averages(self) -> Float[Tensor, "beta param"]:
+        """Exponential moving averages of all steps."""
+        return self._averages / (1 - self._betas ** max(self.t, 1))
+
+    @property
+    def drift(self) -> Float[Tensor, " param"]:
+        """Mean step since phi_0."""
+        return (self._last - self._first) / max(self.t, 1)
+
+    @property
+    def squares(self) -> Float[Tensor, " param"]:
+        """Exponential moving average of squared steps."""
+        return self._squares / (1 - SQUARES_BETA ** max(self.t, 1))
+
+
+def histories(
+    run: Run, starts: Sequence[int], lags: int, betas: Sequence[float]
+) -> Iterator[tuple[int, History]]:
+    """The history at each start, in the order of time.
+
+    A walk always begins at phi_0, so that a forecast does not depend on what was asked before; the
+    next call goes on where the last one of this run ended, if its starts come later.
+
+    Yields:
+        The place of a start among the starts, and the history there, valid until the next one.
+    """
+    key = (lags, tuple(betas))
+    history = _WALKS.setdefault(run, {}).pop(key, None)
+    first = min(starts)
+    if history is None or history.t > first:
+        history = History(run.weights[0], lags, betas)
+    reader = Reader(run.weights, max(starts))
+    for place in np.argsort(np.asarray(starts), kind="stable").tolist():
+        while history.t < starts[place]:
+            (row,) = reader.rows(history.t + 1, history.t + 2)
+            history.push(row.astype(np.float32))
+        yield place, history
+    _WALKS[run][key] = history
+
+
+_WALKS: WeakKeyDictionary[Run, dict[tuple[int, tuple[float, ...]], History]] = WeakKeyDictionary()
+
+__all__ = ["History", "histories"]

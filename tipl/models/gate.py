@@ -1,0 +1,155 @@
+"""A network for one scalar parameter at a time, shared by all parameters of all policies.
+
+It does not output a displacement but *coefficients*, on steps that the parameter made before. So
+it is persistence before training, AR and EMA are special cases, and what it forecasts turns with
+the sign of a parameter and grows with the scale of its steps. It is a mixture of linear filters
+(Jordan and Jacobs, 1994): each *expert* is one filter for all; what a parameter did lately, and
+what its tensor and the whole policy did, says how much of each expert counts. One more filter is
+written for each tensor. Ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+KINDS = ("input weight", "hidden weight", "output weight", "hidden bias", "output bias", "other")
+"""What a tensor is in a policy."""
+LAG_COSINES = 10
+"""Earlier steps that the last step is compared with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateConfig:
+    """What the network sees, and its sizes."""
+
+    horizons: tuple[int, ...]
+    """Snapshots ahead, rising: one output each."""
+    lags: int = 20
+    """Steps that it sees."""
+    betas: tuple[float, ...] = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
+    """Of exponential moving averages of all steps."""
+    phases: int = 5
+    """Snapshots in an iteration of PPO."""
+    width: int = 64
+    """Units of a hidden layer."""
+    experts: int = 12
+    """Linear filters that are mixed."""
+
+    @property
+    def basis(self) -> int:
+        """What coefficients are for: steps, their averages, and the mean step since phi_0."""
+        return self.lags + len(self.betas) + 1
+
+    @property
+    def inputs(self) -> int:
+        """Numbers of a parameter: the basis, and the size of its steps, its row's, its column's."""
+        return self.basis + 3
+
+    @property
+    def contexts(self) -> int:
+        """Numbers of a tensor: of itself and of the whole policy, its kind, phase and time."""
+        averages = len(self.betas)
+        of_steps = LAG_COSINES + 3 * averages + max(0, averages - 3) + 2
+        return 2 * of_steps + 1 + len(KINDS) + (self.phases + 1) + 3
+
+
+class GateNetwork(nn.Module):
+    """From what a parameter did to what it will do."""
+
+    basis_scale: Tensor
+
+    def __init__(self, config: GateConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, outputs = config.width, config.basis * len(config.horizons)
+        self.context = nn.Sequential(
+            nn.Linear(config.contexts, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU()
+        )
+        self.first = nn.Linear(config.inputs, width)
+        self.first_context = nn.Linear(width, width, bias=False)
+        self.second = nn.Linear(width, width)
+        self.second_context = nn.Linear(width, width, bias=False)
+        self.gate = nn.Linear(width, config.experts)
+        self.experts = nn.Parameter(torch.zeros(config.experts, outputs))
+        self.of_tensor = nn.Linear(width, outputs)
+        nn.init.zeros_(self.of_tensor.weight)
+        nn.init.zeros_(self.of_tensor.bias)
+        # Buffers are not learnt: a coefficient of 1 is then a plausible one at each horizon.
+        self.register_buffer("basis_scale", _basis_scale(config), persistent=False)
+
+    def forward(
+        self,
+        inputs: Float[Tensor, "*start param input"],
+        contexts: Float[Tensor, "*start tensor context"],
+        basis: Float[Tensor, "*start param basis"],
+        tensor: Int[Tensor, "*start param"],
+    ) -> Float[Tensor, "*start param horizon"]:
+        """Displacements, in units of the basis.
+
+        Args:
+            inputs: of each parameter; even in its sign.
+            contexts: of each tensor.
+            basis: steps and their averages.
+            tensor: which tensor a parameter belongs to.
+        """
+        hidden = self.context(contexts)
+
+        def spread(values: Tensor) -> Tensor:
+            place = tensor[..., None].expand(*tensor.shape, values.shape[-1])
+            return values.gather(-2, place)
+
+        z = torch.relu(self.first(inputs) + spread(self.first_context(hidden)))
+        z = torch.relu(self.second(z) + spread(self.second_context(hidden)))
+        filters = self.gate(z) @ self.experts + spread(self.of_tensor(hidden))
+        filters = filters.unflatten(-1, self.basis_scale.shape) * self.basis_scale
+        moved: Tensor = (basis[..., None, :] @ filters)[..., 0, :]
+        return moved
+
+    def of_one_tensor(
+        self,
+        inputs: Float[Tensor, "param input"],
+        context: Float[Tensor, " context"],
+        basis: Float[Tensor, "param basis"],
+        horizons: list[int],
+    ) -> Float[Tensor, "param horizon"]:
+        """The same for parameters of one tensor and some horizons, in less time.
+
+        Args:
+            inputs: as in ``forward``.
+            context: of the tensor.
+            basis: as in ``forward``.
+            horizons: places of the wanted horizons.
+        """
+        hidden = self.context(context)
+        size, count = len(horizons), len(self.experts)
+        filters = torch.cat([self.experts, self.of_tensor(hidden)[None]])
+        filters = filters.view(count + 1, *self.basis_scale.shape) * self.basis_scale
+        # Of all parameters of a tensor, the context is one more bias.
+        z = linear(inputs, self.first.weight, self.first.bias + self.first_context(hidden)).relu_()
+        z = linear(z, self.second.weight, self.second.bias + self.second_context(hidden)).relu_()
+        gates = self.gate(z)
+        # Each filter's forecast, then their mixture: cheaper than mixing the filters.
+        each = basis @ filters[..., horizons].transpose(0, 1).flatten(1)
+        *mixed, own = torch.split(each, size, dim=1)
+        moved: Tensor = own.clone()
+        for number, forecast in enumerate(mixed):
+            moved.addcmul_(gates[:, number, None], forecast)
+        return moved
+
+
+def _basis_scale(config: GateConfig) -> Float[Tensor, "basis horizon"]:
+    """How far a displacement goes with a step, an average, or the mean step of the run.
+
+    A step says something of few to come; an average with beta of some 2 / (1 - beta) steps.
+    """
+    steps = [[min(h, 5) ** 0.5 for h in config.horizons]] * config.lags
+    averages = [[min(h, 2 / (1 - beta)) for h in config.horizons] for beta in config.betas]
+    return torch.tensor([*steps, *averages, [float(h) for h in config.horizons]])
+
+
+__all__ = ["KINDS", "LAG_COSINES", "GateConfig", "GateNetwork"]

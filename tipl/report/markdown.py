@@ -1,0 +1,205 @@
+"""Results in Markdown pages: each place says which file it shows, and which part of it.
+
+A place begins with ``<!-- results of FILE, SECTION: rewrite with ... -->`` and ends with
+``<!-- end of results -->``, a line each; what follows a colon is for readers. Without a section it
+shows the overview. Prose around places is nobody's but its author's. The places of other makers
+look alike, with another word for *results*.
+
+| section | what it shows |
+|---|---|
+| ``overview`` | the few columns that matter, and the verdict |
+| ``verdict`` | the sentences only |
+| ``tables`` | all tables, the less important ones folded |
+| ``figures`` | pictures, which lie in a folder beside the page, named after the result file |
+| ``source`` | data, runs, starts and the command that made the results |
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tipl.errors import EvaluateError
+from tipl.report.figures import figures, file_name, titles
+from tipl.report.tables import Table, cell, headline, label, tables
+from tipl.report.verdict import paragraphs, verdict
+
+DPI = 110
+"""Of pictures in Markdown pages."""
+
+_START = r"<!-- (?P<what>\w+) of (?P<source>[^\s,]+?)(?:, (?P<section>\w+))?(?:: [^\n]*?)? -->\n"
+_CONTENT = r"(?:(?!<!-- \w+ of ).)*?"
+_PLACE = re.compile(
+    rf"(?P<start>{_START})(?P<content>{_CONTENT})(?P<end><!-- end of (?P=what) -->)", re.DOTALL
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A part of a page that is rewritten."""
+
+    what: str
+    """``results``, or what else its marker says."""
+    source: str
+    """What it shows: a result file."""
+    section: str
+    """Which part of that."""
+    empty: bool
+    """Whether it has never been written."""
+
+
+def places(page: str) -> list[Place]:
+    """All places of a page, in order."""
+    return [_place(match) for match in _PLACE.finditer(page)]
+
+
+def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> str:
+    """The page with its places of one source written anew.
+
+    Args:
+        page: its text.
+        what: ``results``, or what else the markers say.
+        source: of the places that are written; others stay as they are.
+        render: makes the content of a section.
+
+    Raises:
+        EvaluateError: the page has no such place.
+    """
+    if not any((place.what, place.source) == (what, source) for place in places(page)):
+        raise EvaluateError(
+            f"the page has no place for these {what}",
+            expected=f"<!-- {what} of {source} --> and <!-- end of {what} -->, a line each",
+            do="write both lines where they shall stand",
+        )
+
+    def fill(match: re.Match[str]) -> str:
+        place = _place(match)
+        if (place.what, place.source) != (what, source):
+            return match[0]
+        content = render(place.section)
+        return f"{match['start']}\n{content}\n\n{match['end']}"
+
+    return _PLACE.sub(fill, page)
+
+
+def insert_markdown(results: dict[str, Any], source: Path, page: Path) -> None:
+    """Write every place of a result file in a Markdown page, and the pictures that it shows.
+
+    Raises:
+        EvaluateError: the page has no such place, or one asks for a section that there is not.
+    """
+    old = page.read_text()
+    text = rewrite(old, "results", source.as_posix(), lambda s: render(results, source, s))
+    for place in places(text):
+        if (place.source, place.section) == (source.as_posix(), "figures"):
+            _draw(results, page.parent / source.stem)
+            break
+    page.write_text(text)
+
+
+def render(results: dict[str, Any], source: Path, section: str) -> str:
+    """One section as Markdown; nothing is drawn.
+
+    Raises:
+        EvaluateError: there is no such section.
+    """
+    if section not in _SECTIONS:
+        raise EvaluateError(
+            "there is no such section of results",
+            expected=", ".join(_SECTIONS),
+            got=section,
+            where=source,
+            do="change the marker in the page",
+        )
+    return _SECTIONS[section](results, source)
+
+
+def table_lines(table: Table) -> list[str]:
+    """A table, line by line."""
+    lines = [
+        "| forecaster | " + " | ".join(table.columns) + " |",
+        "|---|" + "---:|" * len(table.columns),
+    ]
+    for name, cells in table.rows:
+        shown = " | ".join(cell(row, table.digits) for row in cells)
+        lines.append(f"| {label(name)} | {shown} |")
+    return lines
+
+
+def _place(match: re.Match[str]) -> Place:
+    return Place(
+        what=match["what"],
+        source=match["source"],
+        section=match["section"] or "overview",
+        empty=not match["content"].strip(),
+    )
+
+
+def _overview(results: dict[str, Any], _: Path) -> str:
+    (table,) = headline(results)
+    return "\n".join([*table_lines(table), "", verdict(results)])
+
+
+def _verdict(results: dict[str, Any], _: Path) -> str:
+    return "\n".join(f"- {paragraph}" for paragraph in paragraphs(results))
+
+
+def _tables(results: dict[str, Any], _: Path) -> str:
+    found = tables(results)
+    lines = []
+    for table in sorted(found, key=lambda table: not table.main):
+        if table.main:
+            lines += [f"**{table.title}**", "", *table_lines(table), ""]
+        else:
+            lines += [f"<details><summary>{table.title}</summary>", "", *table_lines(table)]
+            lines += ["", "</details>", ""]
+    ahead = [label(name) for name, s in results["forecasters"].items() if not s["causal"]]
+    if ahead:
+        lines.append(f"Not causal, they have seen the future of the run: {', '.join(ahead)}.")
+    return "\n".join(lines).rstrip()
+
+
+def _figures(results: dict[str, Any], source: Path) -> str:
+    links = [f"![{title}]({source.stem}/{file_name(title)})" for title in titles(results)]
+    return "\n\n".join(links)
+
+
+def _source(results: dict[str, Any], source: Path) -> str:
+    runs, starts = results["runs"], results["starts"]
+    lines = [
+        f"- data: `{results['data']}`, version {results['version']}; {len(runs)} runs of its "
+        f"{results['split']} split: {', '.join(runs)}",
+        f"- starts: {starts['weights']:,} for weights, {starts['policies']:,} for policies",
+    ]
+    if results["modes"]:
+        lines[-1] += (
+            f", {starts['learning']:,} in the learning phase and {starts['plateau']:,} after it "
+            "for returns"
+        )
+        lines.append(
+            f"- {results['episodes']} episodes for the return of a policy, the same starts for all"
+        )
+    if results["quick"]:
+        lines.append("- a quick look, with fewer starts and episodes")
+    return "\n".join([*lines, f"- made by `{results['command']}`", f"- all numbers: `{source}`"])
+
+
+_SECTIONS: dict[str, Callable[[dict[str, Any], Path], str]] = {
+    "overview": _overview,
+    "verdict": _verdict,
+    "tables": _tables,
+    "figures": _figures,
+    "source": _source,
+}
+
+
+def _draw(results: dict[str, Any], folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    for title, figure in figures(results).items():
+        figure.savefig(folder / file_name(title), dpi=DPI)
+
+
+__all__ = ["Place", "insert_markdown", "places", "render", "rewrite", "table_lines"]

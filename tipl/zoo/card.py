@@ -1,0 +1,282 @@
+"""The card of a released model: prose by hand, and what ``metrics.json`` says between markers.
+
+A card is made once from a template of the model's kind. From then on its prose is its author's, and
+``tipl card`` rewrites only the places that begin with ``<!-- facts of NAME, SECTION: ... -->``. A
+section brings its heading, so that what was not measured leaves no empty one.
+
+| section | what it says |
+|---|---|
+| ``summary`` | data, cadence, runs that it learnt from and was judged on |
+| ``ladder`` | its figures beside the copy's, the floor's and the best baselines' |
+| ``checks`` | the five checks |
+| ``training`` | settings and the error while it was trained |
+| ``commands`` | how the results were made |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from matplotlib.figure import Figure
+
+from tipl.errors import ModelError
+from tipl.report.figures import svg
+from tipl.report.markdown import rewrite, table_lines
+from tipl.report.scores import COPY, floors, row_at, rows_of
+from tipl.report.tables import COLUMNS, cell, headline, label
+from tipl.report.verdict import verdict
+from tipl.zoo import lookup
+from tipl.zoo.metrics import Metrics, read_metrics
+
+HEADLINE = ("skill, h = 1", "skill, h = 10", "gain, h = 50")
+"""Columns that sum a model up."""
+_TESTS = {
+    "null": "random walks: skill is 0",
+    "causality": "the future moves no bit",
+    "permutation": "hidden units in another order",
+    "sign": "hidden units with the other sign",
+    "scale": "steps twice as long",
+    "drift": "a straight line",
+}
+
+
+def listed(name: str) -> tuple[str, ...]:
+    """A line of ``tipl zoo``: name, kind, causal, data set, and the figures of ``HEADLINE``."""
+    folder = lookup.MODELS / name
+    metrics = read_metrics(folder)
+    if metrics is None:
+        return (name, lookup.kind_of(folder), *["-"] * (2 + len(HEADLINE)))
+    figures = [cell(row_at(metrics.scores, *COLUMNS[column])) for column in HEADLINE]
+    causal = "yes" if metrics.causal else "no"
+    return (name, metrics.kind, causal, metrics.results["data"], *figures)
+
+
+def write_card(name: str, out: Path) -> Path:
+    """Write a model's card, or what comes from its figures into the card that is there.
+
+    Args:
+        name: in the zoo.
+        out: folder of the cards.
+
+    Returns:
+        The card.
+
+    Raises:
+        ModelError: there is no such model, or it was not judged.
+    """
+    metrics = metrics_of(name)
+    out.mkdir(parents=True, exist_ok=True)
+    card = out / f"{name}.md"
+    text = card.read_text() if card.exists() else new_card(metrics)
+    card.write_text(refreshed(text, metrics))
+    if metrics.log:
+        (out / f"{name}.svg").write_text(svg(training_figure(metrics)))
+    return card
+
+
+def metrics_of(name: str) -> Metrics:
+    """What is known of a released model.
+
+    Raises:
+        ModelError: there is no such model, or it was not judged.
+    """
+    metrics = read_metrics(lookup.MODELS / name) if name in lookup.names() else None
+    if metrics is None:
+        raise ModelError(
+            "there is no released model of this name with results",
+            expected=", ".join(lookup.names()) or "a released model",
+            got=name,
+            do="release it: `tipl release FOLDER --name NAME --results RESULTS`",
+        )
+    return metrics
+
+
+def new_card(metrics: Metrics) -> str:
+    """A card from the template of its kind, or from the one for all; its places are empty."""
+    loader = jinja2.PackageLoader("tipl", "templates")
+    environment = jinja2.Environment(  # noqa: S701  Markdown, from our own templates
+        loader=loader, trim_blocks=True, keep_trailing_newline=True
+    )
+    wanted = [f"card-{metrics.kind}.md", "card.md"]
+    return environment.select_template(wanted).render(metrics=metrics)
+
+
+def refreshed(card: str, metrics: Metrics) -> str:
+    """The card with its places written anew."""
+    return rewrite(card, "facts", metrics.name, lambda section: facts(metrics, section))
+
+
+def facts(metrics: Metrics, section: str) -> str:
+    """One section as Markdown, empty if there is nothing to say.
+
+    Raises:
+        ModelError: there is no such section.
+    """
+    if section not in _SECTIONS:
+        raise ModelError(
+            "there is no such section of a card",
+            expected=", ".join(_SECTIONS),
+            got=section,
+            where=metrics.name,
+            do="change the marker in the card",
+        )
+    return _SECTIONS[section](metrics)
+
+
+def training_figure(metrics: Metrics) -> Figure:
+    """WPE against batches, beside what the copy and the floor reach one step ahead."""
+    fig = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = fig.subplots()
+    for key, name, color in (
+        ("wpe", "training runs, with dropout", "#2471a3"),
+        ("validation_wpe", "validation runs", "#c0392b"),
+    ):
+        lines = [line for line in metrics.log if key in line]
+        if lines:
+            x, y = ([line[k] for line in lines] for k in ("batch", key))
+            axes.plot(x, y, label=name, color=color, lw=1.5)
+    for name, style in ((COPY, "-"), *((floor, "--") for floor in floors(metrics.results))):
+        row = row_at(metrics.results["forecasters"][name], ("wpe",), 1)
+        if row is not None and row["value"]:
+            text = f"{label(name)}, h = 1, runs it was judged on"
+            axes.axhline(row["value"], ls=style, color="#7f8c8d", lw=1, label=text)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("batches")
+    axes.set_ylabel("WPE")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    return fig
+
+
+def _summary(metrics: Metrics) -> str:
+    results, trained = metrics.results, metrics.trained_on
+    causal = "yes" if metrics.causal else "**no**: it has seen the future of the run"
+    lines = [f"- kind: `{metrics.kind}`; causal: {causal}"]
+    if trained is not None:
+        made = " by ".join(x for x in (trained.environment, trained.algorithm) if x)
+        lines += [
+            f"- learnt from: `{trained.data}`, version {trained.version}, "
+            f"{len(trained.runs)} runs: {', '.join(trained.runs)}",
+            f"- policies: {trained.parameters:,} parameters{f', {made}' if made else ''}",
+        ]
+        if trained.every is not None:
+            lines.append(f"- cadence: a snapshot every {trained.every} gradient steps")
+    return "\n".join(
+        [
+            *lines,
+            f"- judged on: `{results['data']}`, version {results['version']}, "
+            f"{len(results['runs'])} {results['split']} runs: {', '.join(results['runs'])}",
+        ]
+    )
+
+
+def _ladder(metrics: Metrics) -> str:
+    (table,) = headline(metrics.results)
+    own = metrics.results | {
+        "forecasters": {n: metrics.results["forecasters"][n] for n in (COPY, metrics.judged_as)}
+    }
+    told = verdict(own) if metrics.judged_as.startswith("tipl") else ""
+    note = (
+        "95 % intervals: bootstrap over runs. Skill: 0 is the copy of the last weights, 1 the "
+        "truth. Of the baselines the best ones are shown."
+    )
+    if metrics.results["modes"]:
+        note += (
+            " Gain: of the return that training earns in h snapshots, with the exploration noise "
+            "of the start."
+        )
+    text = "\n".join(["## How well", "", *table_lines(table), "", note])
+    return f"{text}\n\n{told}" if told else text
+
+
+def _checks(metrics: Metrics) -> str:
+    checks = metrics.checks
+    if checks is None:
+        return ""
+    null = ", ".join(f"{skill:.2g} at h = {h}" for h, skill in checks["null"].items())
+    lines = ["## Five checks", "", "| check | measured | passes |", "|---|---|---|"]
+    for name, meaning in _TESTS.items():
+        shown = f"skill {null}" if name == "null" else _measured(name, checks[name])
+        lines.append(f"| {meaning} | {shown} | {'yes' if checks['passed'][name] else 'no'} |")
+    limits = checks["largest"]
+    again = (
+        f"For the random walks one like it was fitted to {checks['walks'] - 2} others"
+        f"{_batches(metrics.kind, checks)}. "
+        if checks["fitted_to_walks"]
+        else ""
+    )
+    lines += [
+        "",
+        f"{again}A skill passes below {limits['null']} either way, an error, relative to the "
+        f"displacement, below {limits['error']}. On run `{checks['run']}`: `{checks['command']}`",
+    ]
+    return "\n".join(lines)
+
+
+def _batches(kind: str, checks: dict[str, Any]) -> str:
+    return "" if kind == "regression" else f", for {checks['batches']:,} batches"
+
+
+def _measured(name: str, value: object) -> str:
+    if value is None:
+        return "its basis needs more directions" if name == "drift" else "no such units"
+    if isinstance(value, bool):
+        return "the same bits" if value else "other bits"
+    return f"error {value:.2g}"
+
+
+def _training(metrics: Metrics) -> str:
+    if not metrics.settings and not metrics.log:
+        return ""
+    lines = ["## Training"]
+    if metrics.settings:
+        lines += ["", "Settings: " + ", ".join(f"{k} {v}" for k, v in metrics.settings.items())]
+    if metrics.log:
+        last = metrics.log[-1]
+        errors = [f"WPE {last['wpe']:.3g} on training runs"]
+        if "validation_wpe" in last:
+            errors.append(f"{last['validation_wpe']:.3g} on validation runs")
+        copy = rows_of(metrics.results["forecasters"][COPY], ("wpe",))[0]
+        lines += [
+            "",
+            f"After {last['batch']:,.0f} batches: {', '.join(errors)}; the copy's, "
+            f"h = {copy['h']}, on the runs it was judged on, is {copy['value']:.3g}.",
+            "",
+            f"![weight prediction error against batches]({metrics.name}.svg)",
+        ]
+    return "\n".join(lines)
+
+
+def _commands(metrics: Metrics) -> str:
+    commands = [metrics.results["command"]]
+    if metrics.trained_on is not None and metrics.kind == "tipl":
+        given = " ".join(
+            f"--{key.replace('_', '-')} {value}" for key, value in metrics.settings.items()
+        )
+        commands.insert(0, f"tipl train --data {metrics.trained_on.data} --out FOLDER {given}")
+    return "\n".join(["```bash", *commands, "```"])
+
+
+_SECTIONS: dict[str, Callable[[Metrics], str]] = {
+    "summary": _summary,
+    "ladder": _ladder,
+    "checks": _checks,
+    "training": _training,
+    "commands": _commands,
+}
+
+
+__all__ = [
+    "HEADLINE",
+    "facts",
+    "listed",
+    "metrics_of",
+    "new_card",
+    "refreshed",
+    "training_figure",
+    "write_card",
+]

@@ -1,0 +1,75 @@
+"""Where a forecaster of a name lies, and which class reads it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tipl import baselines
+from tipl.errors import ForecastError, ModelError
+from tipl.forecast import TIPL, Forecaster
+from tipl.gate import Gate
+
+MODELS = Path(__file__).with_name("models")
+"""A folder for each released model; they come with the package."""
+KINDS: dict[str, type[Forecaster]] = {"tipl": TIPL, Gate.kind: Gate, **baselines.KINDS}
+"""The class of each ``kind`` that config.json of a saved forecaster may name."""
+
+
+def names() -> list[str]:
+    """The released models."""
+    return sorted(file.parent.name for file in MODELS.glob("*/config.json"))
+
+
+def load(name: str | Path) -> Forecaster:
+    """A forecaster: from the folder that it was saved in, or a released one by its name.
+
+    Looked for in this order: a folder, a model of the zoo, a baseline that needs no fit. A released
+    model is part of the package: nothing is downloaded.
+
+    Raises:
+        ForecastError: there is no such folder, and no forecaster of this name.
+        ModelError: the folder holds something else.
+    """
+    path = Path(name)
+    if not (path / "config.json").is_file() and str(name) in names():
+        path = MODELS / path
+    if (path / "config.json").is_file():
+        return KINDS[kind_of(path)].load(path)
+    if str(name) in baselines.names():
+        return baselines.by_name(str(name))
+    raise ForecastError(
+        "there is no such forecaster",
+        expected="a folder with config.json, or one of "
+        + ", ".join([*names(), *baselines.names()]),
+        got=str(name),
+        do="name the folder that `tipl train` or `tipl fit` made, or see `tipl zoo`",
+    )
+
+
+def kind_of(folder: Path) -> str:
+    """The kind of the forecaster that a folder holds.
+
+    Raises:
+        ModelError: it holds none.
+    """
+    try:
+        kind = str(json.loads((folder / "config.json").read_text())["kind"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _nothing(folder, error) from error
+    if kind not in KINDS:
+        raise _nothing(folder, kind)
+    return kind
+
+
+def _nothing(folder: Path, got: object) -> ModelError:
+    return ModelError(
+        "the folder holds no forecaster",
+        expected=f'config.json with a "kind" of {sorted(KINDS)}',
+        got=got,
+        where=folder,
+        do="name a folder that `tipl train`, `tipl fit` or save() wrote",
+    )
+
+
+__all__ = ["KINDS", "MODELS", "kind_of", "load", "names"]

@@ -1,0 +1,224 @@
+"""Puts a trained forecaster into the zoo, with what is known of it.
+
+What is released must be what was judged, byte for byte, and a model above 3 MB is rounded when it
+is released. So it goes in two steps, with the judging between them::
+
+    tipl release FOLDER --name NAME
+    tipl evaluate NAME ... --data DATA --out OUT
+    tipl release FOLDER --name NAME --results OUT/results.json
+
+The first one puts the model into the zoo, rounded if it must be, as a draft without figures. It is
+judged there, by its name. The second one adds the figures, if the results say that they are of the
+bytes that lie in the zoo (``fingerprint``); a model that needs no rounding can be judged before.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load_file, save
+
+import weighttraj as wt
+from tipl import baselines
+from tipl.errors import ModelError
+from tipl.evaluation.parts import fingerprint
+from tipl.report.scores import FUNCTION_SKILL, GAIN, REPW, SKILL, floors, rows_of, that_matter
+from tipl.zoo import lookup
+from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics, write_metrics
+
+MOST = 3_000_000
+"""Bytes of a model's arrays. Larger ones are rounded to float16, and refused if still larger."""
+LINES = 100
+"""Of a training's log that are kept."""
+_ARRAYS = "model.safetensors"
+_NAME = re.compile(r"[a-z0-9][a-z0-9.-]*")
+_OF_THE_MACHINE = ("data", "out", "runs", "device", "threads", "compile")
+"""Settings of a training that say nothing of the model."""
+
+
+def release(
+    folder: Path,
+    name: str,
+    *,
+    results: Path | None = None,
+    checks: Path | None = None,
+    log: bool = True,
+) -> Path:
+    """Copy a forecaster into the zoo; with results, also what is known of it.
+
+    Args:
+        folder: of the trained model; its train.json and log.jsonl are read, if they are there.
+        name: in the zoo.
+        results: a results.json in which the model of the zoo was judged; None: a draft.
+        checks: what ``tipl check`` wrote of it.
+        log: keep some lines of the training's log.
+
+    Returns:
+        The model's folder in the zoo.
+
+    Raises:
+        ModelError: the folder holds no forecaster or too large a one, the name will not do, or
+            results or checks are of other bytes.
+    """
+    _check_name(name)
+    kind = lookup.kind_of(folder)
+    out = lookup.MODELS / name
+    _copy(folder, out)
+    forecaster = lookup.load(out)
+    mark = fingerprint(forecaster)
+    known = read_metrics(out)
+    if known is not None and known.fingerprint != mark:
+        (out / FILE).unlink()  # of a model that was released before
+    if results is None:
+        return out
+    document = json.loads(results.read_text())
+    judged_as = _find(document, mark, name, results)
+    settings = _json(folder / "train.json")
+    metrics = Metrics(
+        name=name,
+        kind=kind,
+        causal=forecaster.causal,
+        fingerprint=mark,
+        judged_as=judged_as,
+        results=reduced(document, judged_as),
+        trained_on=_trained_on(settings),
+        settings={k: v for k, v in settings.items() if k not in _OF_THE_MACHINE},
+        log=thinned(folder / "log.jsonl") if log else [],
+        checks=None if checks is None else _checks(checks, mark, name),
+    )
+    write_metrics(out, metrics)
+    return out
+
+
+def reduced(results: dict[str, Any], judged_as: str) -> dict[str, Any]:
+    """A result file, of the forecasters and figures that matter: ``tipl.report`` reads it too."""
+    chosen = {judged_as, *that_matter(results), *floors(results)}
+    forecasters = {
+        name: {
+            key: scores[key] for key in ("causal", "floor", "wpe", "repw_ratio") if key in scores
+        }
+        | _nested(scores)
+        for name, scores in results["forecasters"].items()
+        if name in chosen
+    }
+    return results | {"forecasters": forecasters}
+
+
+def thinned(log: Path) -> list[dict[str, float]]:
+    """At most ``LINES`` lines of a log, evenly spaced on a logarithmic scale of batches."""
+    if not log.exists():
+        return []
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    last = len(lines) - 1
+    chosen = np.unique(np.geomspace(1, last + 1, min(LINES, last + 1)).round().astype(int)) - 1
+    kept = ("batch", "wpe", "validation_wpe")
+    return [{key: lines[i][key] for key in kept if key in lines[i]} for i in chosen]
+
+
+def _check_name(name: str) -> None:
+    if _NAME.fullmatch(name) is None or name in baselines.names():
+        raise ModelError(
+            "a model of the zoo cannot be called this",
+            expected="lower-case letters, digits, dots and hyphens; no name of a baseline",
+            got=name,
+            do="choose another --name",
+        )
+
+
+def _copy(folder: Path, out: Path) -> None:
+    """Write config.json, and the arrays, rounded if they are too large.
+
+    Only matrices are rounded: vectors weigh nothing, and scales among them need their digits.
+    """
+    arrays = load_file(folder / _ARRAYS) if (folder / _ARRAYS).exists() else None
+    packed = None if arrays is None else save(arrays)
+    if arrays is not None and packed is not None and len(packed) > MOST:
+        with np.errstate(over="ignore"):
+            arrays = {k: v.astype(np.float16) if _rounds(v) else v for k, v in arrays.items()}
+        packed = save(arrays)
+        if len(packed) > MOST or not all(np.isfinite(v).all() for v in arrays.values()):
+            raise ModelError(
+                "the model is too large for the zoo",
+                expected=f"at most {MOST:,} bytes of finite numbers in float16",
+                got=f"{len(packed):,} bytes",
+                where=folder,
+                do="train a smaller one, or keep it in a folder of its own",
+            )
+    out.mkdir(parents=True, exist_ok=True)
+    if packed is not None:
+        (out / _ARRAYS).write_bytes(packed)
+    (out / "config.json").write_bytes((folder / "config.json").read_bytes())
+
+
+def _rounds(array: np.ndarray) -> bool:
+    return array.ndim > 1 and array.dtype == np.float32
+
+
+def _find(results: dict[str, Any], mark: str, name: str, where: Path) -> str:
+    """What the model of these bytes is called in the results."""
+    marks = {n: s.get("fingerprint") for n, s in results["forecasters"].items()}
+    if results["split"] == "train" or mark not in marks.values():
+        raise ModelError(
+            "the results are not of this model on runs that it has not seen",
+            expected=f"a forecaster of fingerprint {mark}, on the validation or test split",
+            got=f"{results['split']} split: {marks}",
+            where=where,
+            do=f"judge the model as it now lies in the zoo, `tipl evaluate {name} ...`, and give "
+            "those results",
+        )
+    return next(str(n) for n, m in marks.items() if m == mark)
+
+
+def _checks(file: Path, mark: str, name: str) -> dict[str, Any]:
+    checks = _json(file)
+    if checks.get("fingerprint") != mark:
+        raise ModelError(
+            "the checks are not of this model",
+            expected=f"fingerprint {mark}",
+            got=checks.get("fingerprint"),
+            where=file,
+            do=f"check the model as it now lies in the zoo: `tipl check {name} ...`",
+        )
+    return checks
+
+
+def _trained_on(settings: dict[str, Any]) -> TrainedOn | None:
+    """The runs that a training's settings name, looked up in their data set."""
+    if not {"data", "runs"} <= settings.keys():
+        return None
+    dataset = wt.open_dataset(settings["data"])
+    run = dataset[next(iter(settings["runs"]))]
+    info = run.info
+    return TrainedOn(
+        data=dataset.info.id,
+        version=dataset.info.version,
+        runs=tuple(settings["runs"]),
+        environment=info.env.id if info.env else None,
+        algorithm=info.algorithm.name if info.algorithm else None,
+        every=info.cadence.every if info.cadence else None,
+        parameters=info.layout.size,
+    )
+
+
+def _nested(scores: dict[str, Any]) -> dict[str, Any]:
+    """The rows that a card shows, where they stood."""
+    found: dict[str, Any] = {}
+    for path in (SKILL, FUNCTION_SKILL, GAIN, REPW):
+        if rows := rows_of(scores, path):
+            there = found
+            for key in path[:-1]:
+                there = there.setdefault(key, {})
+            there[path[-1]] = rows
+    return found
+
+
+def _json(file: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    return found
+
+
+__all__ = ["LINES", "MOST", "reduced", "release", "thinned"]
