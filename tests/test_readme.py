@@ -25,7 +25,12 @@ PAGES = [ROOT / "README.md", *sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("cards
 BLOCKS = re.findall(r"```(python|bash)\n(.*?)```", README, re.DOTALL)
 
 # The commands run as they stand, on a shorter recipe and with less of what only takes time.
-SHORTER = {"--n-batches 500": "--n-batches 4", "--episodes 5": "--episodes 1"}
+SHORTER = {
+    "--n-batches 500": "--n-batches 4",
+    "--n-batches 400": "--n-batches 4",
+    "--steps 500": "--steps 4",
+    "--episodes 5": "--episodes 1",
+}
 SHORT_RECIPE = {
     "51_200": "768\nn_steps = 64\nbatch_size = 16\nn_epochs = 2\ncritic_arch = [8, 8]",
     "every = 64": "every = 2\nblock = 8\nprobe_observations = 4",
@@ -49,6 +54,7 @@ def folder(tmp_path: Path, small_dataset: Path, monkeypatch: pytest.MonkeyPatch)
     return tmp_path
 
 
+@pytest.mark.timeout(500)  # each command starts a process
 def test_every_block_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     names: dict[str, Any] = {}

@@ -13,7 +13,16 @@ import torch
 import weighttraj as wt
 from tipl.baselines import Ema
 from tipl.baselines.trajectory import Trajectory
-from tipl.checks import TOLERANCE, causality, equivariance, run_like, scale, skills
+from tipl.checks import (
+    NULL,
+    TOLERANCE,
+    causality,
+    equivariance,
+    random_walks,
+    run_like,
+    scale,
+    skills,
+)
 from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.gate import Gate, GateTrainConfig, train_gate
 from tipl.gate import train as training
@@ -23,6 +32,7 @@ from tipl.gate.forecaster import GateModelConfig
 from tipl.gate.history import History, histories
 from tipl.gate.train import relative_error
 from tipl.models.gate import GateConfig, GateNetwork
+from tipl.refit import RefitConfig, refit_of
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
 HORIZONS = (1, 2, 5)
@@ -136,7 +146,7 @@ def test_one_tensor_after_the_other_is_the_whole(runs: list[wt.Run]) -> None:
     torch.testing.assert_close(parts, whole.T[[2, 0]], rtol=1e-4, atol=1e-8)
 
 
-# The tests of a causal forecaster; that on random walks is among the checks of all models.
+# The tests of a causal forecaster
 
 
 def test_it_is_causal(runs: list[wt.Run], tmp_path: Path) -> None:
@@ -151,6 +161,19 @@ def test_it_follows_symmetries(symmetry: str, runs: list[wt.Run], tmp_path: Path
 
 def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
     assert scale(lively(), runs[0], tmp_path, [9, 40], HORIZONS) < TOLERANCE
+
+
+def test_it_finds_nothing_in_random_walks(
+    trained: Gate, runs: list[wt.Run], tmp_path: Path
+) -> None:
+    walks = random_walks(runs[0], tmp_path, count=6)
+    config = RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=60)
+    fit = refit_of(trained, config)
+    assert fit is not None
+    again = fit(walks[2:])
+    assert isinstance(again, Gate)
+    assert again.config.network == trained.config.network
+    assert (np.abs(skills(again, walks[:2], HORIZONS)) < NULL).all()
 
 
 def test_one_network_serves_policies_of_any_size(tmp_path: Path) -> None:

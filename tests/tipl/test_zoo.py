@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from tipl import (
 from tipl.errors import EvaluateError, ForecastError, ModelError
 from tipl.evaluation.parts import fingerprint
 from tipl.forecast import TIPLConfig
+from tipl.gate import GateTrainConfig, train_gate
 from tipl.models.gpt import GPT, GPTConfig
 from tipl.report.markdown import places
 from tipl.zoo import names
@@ -35,6 +37,7 @@ from tipl.zoo.card import facts, listed, metrics_of, refreshed, write_card
 from tipl.zoo.lookup import MODELS
 from tipl.zoo.metrics import read_metrics
 from tipl.zoo.release import LINES, MOST, release, thinned
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
 ROOT = Path(__file__).parents[2]
 
@@ -155,9 +158,9 @@ def test_metrics_say_everything(trained: Path, zoo: Path, results: Path, checks:
     assert found is not None
     assert (found.name, found.kind, found.causal) == ("tipl-small", "tipl", False)
     assert found.trained_on is not None
-    assert found.trained_on.runs == ("seed0000", "seed0001")
-    assert (found.trained_on.data, found.trained_on.every) == ("small", 2)
-    assert found.trained_on.environment == "InvertedPendulum-v4"
+    (data,) = found.trained_on
+    assert data.runs == ("seed0000", "seed0001")
+    assert (data.data, data.every, data.environment) == ("small", 2, "InvertedPendulum-v4")
     assert found.results["runs"] == ["seed0002", "seed0003"]
     judged = json.loads(results.read_text())["forecasters"]
     assert set(found.results["forecasters"]) == set(judged)
@@ -370,6 +373,33 @@ def test_the_commands_go_all_the_way(
     assert "tipl evaluate tipl-a" in text
     assert "| a straight line | its basis needs more directions | no |" in text
     assert "| the future moves no bit | other bits | no |" in text
+
+
+def test_a_gate_is_released_with_its_data_sets(
+    small_dataset: Path, zoo: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "data/other"
+    shutil.copytree(small_dataset, other)
+    info = read_dataset_info(other)
+    write_dataset_info(other, replace(info, id="other"))
+    out = tmp_path / "model"
+    train_gate(
+        GateTrainConfig(
+            data=(small_dataset, other), out=out, horizons=(1, 5), starts=20, n_batches=4,
+            batch_size=4, validate_every=2, width=8, experts=2,
+        )
+    )  # fmt: skip
+    few = {"horizons": (1, 5), "learning_starts": 0, "function_starts": 0, "bootstrap": 10}
+    judged = EvaluateConfig(data=small_dataset, out=tmp_path / "judged", starts=9, **few)
+    evaluate([load(out)], judged)
+    release(out, "tipl-gate-small", results=judged.out / "results.json")
+    text = write_card("tipl-gate-small", tmp_path / "cards").read_text()
+    assert "datasets:\n- small\n- other\n" in text
+    assert text.count("- learnt from: ") == 2
+    assert "tipl train-gate --data small other --out FOLDER --horizons 1 5 --starts 20" in text
+    assert "After 4 batches, the squared error over the copy's" in text
+    assert (tmp_path / "cards/tipl-gate-small.svg").exists()
+    assert listed("tipl-gate-small")[1:3] == ("gate", "yes")
 
 
 @pytest.mark.parametrize("name", names())

@@ -100,7 +100,7 @@ class _Training:
         self._settings = asdict(config) | {
             "data": [str(data) for data in config.data],
             "out": str(config.out),
-            "runs": {run.id: digest_of(run) for run in runs},
+            "runs": [{run.id: digest_of(run) for run in group} for group in self._train],
         }
 
     def run(self) -> Gate:

@@ -127,36 +127,41 @@ def facts(metrics: Metrics, section: str) -> str:
 
 
 def training_figure(metrics: Metrics) -> Figure:
-    """WPE against batches, beside what the copy and the floor reach one step ahead."""
+    """Errors against batches; of WPE, beside what the copy and the floor reach one step ahead."""
     fig = Figure(figsize=(7, 3.6), layout="constrained")
     axes = fig.subplots()
     for key, name, color in (
         ("wpe", "training runs, with dropout", "#2471a3"),
         ("validation_wpe", "validation runs", "#c0392b"),
+        ("error", "training runs", "#2471a3"),
+        ("validation_error", "validation runs", "#c0392b"),
     ):
         lines = [line for line in metrics.log if key in line]
         if lines:
             x, y = ([line[k] for line in lines] for k in ("batch", key))
             axes.plot(x, y, label=name, color=color, lw=1.5)
-    for name, style in ((COPY, "-"), *((floor, "--") for floor in floors(metrics.results))):
+    measured = "wpe" if "wpe" in metrics.log[-1] else "error over the copy's"
+    beside = ((COPY, "-"), *((floor, "--") for floor in floors(metrics.results)))
+    for name, style in beside if measured == "wpe" else ():
         row = row_at(metrics.results["forecasters"][name], ("wpe",), 1)
         if row is not None and row["value"]:
             text = f"{label(name)}, h = 1, runs it was judged on"
             axes.axhline(row["value"], ls=style, color="#7f8c8d", lw=1, label=text)
     axes.set_xscale("log")
-    axes.set_yscale("log")
+    if measured == "wpe":
+        axes.set_yscale("log")
     axes.set_xlabel("batches")
-    axes.set_ylabel("WPE")
+    axes.set_ylabel(measured.replace("wpe", "WPE"))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
     return fig
 
 
 def _summary(metrics: Metrics) -> str:
-    results, trained = metrics.results, metrics.trained_on
+    results = metrics.results
     causal = "yes" if metrics.causal else "**no**: it has seen the future of the run"
     lines = [f"- kind: `{metrics.kind}`; causal: {causal}"]
-    if trained is not None:
+    for trained in metrics.trained_on:
         made = " by ".join(x for x in (trained.environment, trained.algorithm) if x)
         lines += [
             f"- learnt from: `{trained.data}`, version {trained.version}, "
@@ -236,29 +241,44 @@ def _training(metrics: Metrics) -> str:
     if metrics.settings:
         lines += ["", "Settings: " + ", ".join(f"{k} {v}" for k, v in metrics.settings.items())]
     if metrics.log:
-        last = metrics.log[-1]
-        errors = [f"WPE {last['wpe']:.3g} on training runs"]
-        if "validation_wpe" in last:
-            errors.append(f"{last['validation_wpe']:.3g} on validation runs")
-        copy = rows_of(metrics.results["forecasters"][COPY], ("wpe",))[0]
-        lines += [
-            "",
-            f"After {last['batch']:,.0f} batches: {', '.join(errors)}; the copy's, "
-            f"h = {copy['h']}, on the runs it was judged on, is {copy['value']:.3g}.",
-            "",
-            f"![weight prediction error against batches]({metrics.name}.svg)",
-        ]
+        lines += ["", _errors(metrics), "", f"![error against batches]({metrics.name}.svg)"]
     return "\n".join(lines)
+
+
+def _errors(metrics: Metrics) -> str:
+    """Where the training ended."""
+    last = metrics.log[-1]
+    key = "wpe" if "wpe" in last else "error"
+    found = [f"{last[key]:.3g} on training runs"]
+    if (held_out := f"validation_{key}") in last:
+        found.append(f"{last[held_out]:.3g} on validation runs")
+    after = f"After {last['batch']:,.0f} batches, "
+    if key == "error":
+        return after + (
+            "the squared error over the copy's, a mean over starts and horizons, is "
+            f"{' and '.join(found)}. The state that is best on validation runs is kept."
+        )
+    copy = rows_of(metrics.results["forecasters"][COPY], ("wpe",))[0]
+    return after + (
+        f"WPE is {' and '.join(found)}; the copy's, h = {copy['h']}, on the runs that it was "
+        f"judged on, is {copy['value']:.3g}."
+    )
 
 
 def _commands(metrics: Metrics) -> str:
     commands = [metrics.results["command"]]
-    if metrics.trained_on is not None and metrics.kind == "tipl":
-        given = " ".join(
-            f"--{key.replace('_', '-')} {value}" for key, value in metrics.settings.items()
-        )
-        commands.insert(0, f"tipl train --data {metrics.trained_on.data} --out FOLDER {given}")
+    command = {"tipl": "train", "gate": "train-gate"}.get(metrics.kind)
+    if metrics.trained_on and command:
+        data = " ".join(trained.data for trained in metrics.trained_on)
+        given = " ".join(map(_option, metrics.settings.items()))
+        commands.insert(0, f"tipl {command} --data {data} --out FOLDER {given}")
     return "\n".join(["```bash", *commands, "```"])
+
+
+def _option(setting: tuple[str, Any]) -> str:
+    key, value = setting
+    values = value if isinstance(value, list) else [value]
+    return f"--{key.replace('_', '-')} {' '.join(map(str, values))}"
 
 
 _SECTIONS: dict[str, Callable[[Metrics], str]] = {

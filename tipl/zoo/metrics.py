@@ -50,12 +50,12 @@ class Metrics:
     """Its name in ``results``."""
     results: dict[str, Any]
     """A result file, of those that matter and of the figures that matter."""
-    trained_on: TrainedOn | None = None
-    """What it learnt from; None: it was not trained by a command that says."""
+    trained_on: tuple[TrainedOn, ...] = ()
+    """What it learnt from, a data set each; empty: it was not trained by a command that says."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Of the training."""
     log: list[dict[str, float]] = field(default_factory=list)
-    """Some lines of the training's log: ``batch``, ``wpe``, ``validation_wpe``."""
+    """Some lines of the training's log: ``batch``, and errors on training and validation runs."""
     checks: dict[str, Any] | None = None
     """What ``tipl check`` wrote; None: not checked."""
 

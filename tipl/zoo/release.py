@@ -36,6 +36,7 @@ LINES = 100
 """Of a training's log that are kept."""
 _ARRAYS = "model.safetensors"
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]*")
+_OF_THE_SPEED = ("batches_per_s",)
 _OF_THE_MACHINE = ("data", "out", "runs", "device", "threads", "compile")
 """Settings of a training that say nothing of the model."""
 
@@ -115,8 +116,7 @@ def thinned(log: Path) -> list[dict[str, float]]:
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     last = len(lines) - 1
     chosen = np.unique(np.geomspace(1, last + 1, min(LINES, last + 1)).round().astype(int)) - 1
-    kept = ("batch", "wpe", "validation_wpe")
-    return [{key: lines[i][key] for key in kept if key in lines[i]} for i in chosen]
+    return [{k: v for k, v in lines[i].items() if k not in _OF_THE_SPEED} for i in chosen]
 
 
 def _check_name(name: str) -> None:
@@ -186,17 +186,23 @@ def _checks(file: Path, mark: str, name: str) -> dict[str, Any]:
     return checks
 
 
-def _trained_on(settings: dict[str, Any]) -> TrainedOn | None:
-    """The runs that a training's settings name, looked up in their data set."""
+def _trained_on(settings: dict[str, Any]) -> tuple[TrainedOn, ...]:
+    """The runs that a training's settings name: of one data set, or of several in order."""
     if not {"data", "runs"} <= settings.keys():
-        return None
-    dataset = wt.open_dataset(settings["data"])
-    run = dataset[next(iter(settings["runs"]))]
-    info = run.info
+        return ()
+    data, runs = settings["data"], settings["runs"]
+    if isinstance(data, str):
+        data, runs = [data], [runs]
+    return tuple(_of_one(*pair) for pair in zip(data, runs, strict=True))
+
+
+def _of_one(data: str, runs: dict[str, str]) -> TrainedOn:
+    dataset = wt.open_dataset(data)
+    info = dataset[next(iter(runs))].info
     return TrainedOn(
         data=dataset.info.id,
         version=dataset.info.version,
-        runs=tuple(settings["runs"]),
+        runs=tuple(runs),
         environment=info.env.id if info.env else None,
         algorithm=info.algorithm.name if info.algorithm else None,
         every=info.cadence.every if info.cadence else None,
