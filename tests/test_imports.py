@@ -198,6 +198,13 @@ ALLOWED = {
         "tipl.forecast",
         "tipl.gate",
         "tipl.models",
+        "tipl.learn",
+        "door weighttraj",
+        "weighttraj.threads",
+    ],
+    "tipl.learn": [
+        "tipl.baselines.horizons",
+        "tipl.errors",
         "tipl.prepare",
         "tipl.progress",
         "tipl.state",

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import weighttraj as wt
+from tipl import learn as learning
 from tipl.baselines import Ema
 from tipl.baselines.trajectory import Trajectory
 from tipl.checks import (
@@ -25,7 +26,6 @@ from tipl.checks import (
 )
 from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.gate import Gate, GateTrainConfig, train_gate
-from tipl.gate import train as training
 from tipl.gate.examples import PARAMS, gather
 from tipl.gate.features import Clock, Structure, features
 from tipl.gate.forecaster import GateModelConfig
@@ -224,16 +224,16 @@ def test_it_learns(trained: Gate, config: GateTrainConfig) -> None:
 def test_an_interrupted_training_ends_as_an_undisturbed_one(
     trained: Gate, config: GateTrainConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    step = training._Training._step
+    step = learning._Training._step
 
-    def stopped(self: Any, network: Any, optimizer: Any, examples: Any, n: int) -> float:
+    def stopped(self: Any, examples: Any, n: int) -> float:
         if n == 33:
             raise KeyboardInterrupt
-        return step(self, network, optimizer, examples, n)
+        return step(self, examples, n)
 
     settings = replace(config, out=tmp_path / "model")
     with monkeypatch.context() as patch:
-        patch.setattr(training._Training, "_step", stopped)
+        patch.setattr(learning._Training, "_step", stopped)
         with pytest.raises(KeyboardInterrupt):
             train_gate(settings)
     again = train_gate(settings)

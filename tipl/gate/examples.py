@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tipl.baselines.trajectory import columns_of, stratified
-from tipl.errors import TrainError
 from tipl.gate.features import Clock, Structure, features
 from tipl.gate.history import histories
+from tipl.learn import Tell, draw_starts, too_short
 from tipl.models.gate import GateConfig
 from weighttraj import Run
 
@@ -24,7 +24,7 @@ POOL = 1024
 
 
 @dataclass(frozen=True, kw_only=True)
-class Examples:
+class GateExamples:
     """Starts, in units of the RMS step around each. Half precision: a third of a gigabyte."""
 
     inputs: Float[Tensor, "start param input"]
@@ -47,8 +47,10 @@ class Examples:
     def __len__(self) -> int:
         return len(self.inputs)
 
-    def __getitem__(self, rows: Int[Tensor, " some"]) -> Examples:
-        return Examples(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+    def __getitem__(self, rows: Int[Tensor, " some"]) -> GateExamples:
+        return GateExamples(
+            **{field.name: getattr(self, field.name)[rows] for field in fields(self)}
+        )
 
 
 def gather(
@@ -57,8 +59,8 @@ def gather(
     *,
     starts: int,
     seed: int,
-    tell: Callable[[Run], None] = lambda _: None,
-) -> Examples:
+    tell: Tell = lambda _: None,
+) -> GateExamples:
     """Examples from runs of one or several data sets. Each run is read twice, row by row.
 
     Half of the starts lie evenly in time, half on a logarithmic scale: the learning phase is short.
@@ -84,12 +86,8 @@ def gather(
                 found.append(one | {"group": torch.tensor(group)})
             tell(run)
     if not found or not all(_reaches(found, place) for place in range(len(config.horizons))):
-        raise TrainError(
-            "the runs are too short to train for each horizon",
-            expected=f"runs of more than {max(config.horizons) + 2} snapshots",
-            do="train for fewer horizons, or collect longer runs",
-        )
-    return Examples(**{name: torch.stack([one[name] for one in found]) for name in found[0]})
+        raise too_short(config.horizons)
+    return GateExamples(**{name: torch.stack([one[name] for one in found]) for name in found[0]})
 
 
 def _reaches(found: Sequence[dict[str, Tensor]], place: int) -> bool:
@@ -102,7 +100,7 @@ def _of_run(
     structure, clock = Structure.of(run.layout), Clock.of(run)
     columns, counts = stratified(structure.tensor.numpy(), POOL, rng)
     weights = columns_of(run.weights, columns)
-    starts = _draw(len(run), count, rng)
+    starts = draw_starts(len(run), count, rng)
     for place, history in histories(run, starts, config.lags, config.betas):
         seen = features(history, structure, clock, config)
         scale = float(history.squares.mean().sqrt())
@@ -128,17 +126,6 @@ def _of_run(
         }
 
 
-def _draw(length: int, count: int, rng: np.random.Generator) -> list[int]:
-    """Starts from 1 to the last but one."""
-    last = length - 2
-    if last < 1:
-        return []
-    u = rng.uniform(size=count)
-    even, early = 1 + u * last, np.exp(u * np.log(last + 1))
-    drawn = np.where(np.arange(count) % 2, even, early).astype(int)
-    return np.unique(np.clip(drawn, 1, last)).tolist()  # type: ignore[no-any-return]
-
-
 def _targets(
     weights: Float[np.ndarray, "time some"],
     counts: Float[np.ndarray, " some"],
@@ -153,4 +140,4 @@ def _targets(
     return target, energy
 
 
-__all__ = ["PARAMS", "POOL", "Examples", "gather"]
+__all__ = ["PARAMS", "POOL", "GateExamples", "gather"]
