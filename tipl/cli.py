@@ -21,6 +21,7 @@ try:
     import tipl
     from tipl import report
     from tipl.baselines import HORIZONS, TrainingConfig
+    from tipl.causal import CausalTrainConfig, train_causal
     from tipl.distributed import rank_here
     from tipl.evaluation import EvaluateConfig
     from tipl.gate import GateTrainConfig, train_gate
@@ -57,6 +58,15 @@ def _train_gate(config: GateTrainConfig) -> None:
     """Train tipl-gate on the training runs of one or several data sets, or go on; minutes."""
     signal.signal(signal.SIGTERM, _stop)
     train_gate(config, console=console)
+    print(f"model in {config.out}")
+
+
+@app.command(name="train-causal")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _train_causal(config: CausalTrainConfig) -> None:
+    """Train tipl-causal on the training runs of one or several data sets, or go on."""
+    signal.signal(signal.SIGTERM, _stop)
+    train_causal(config, console=console)
     print(f"model in {config.out}")
 
 

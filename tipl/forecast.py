@@ -78,6 +78,30 @@ def check_request(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> N
         )
 
 
+def check_cadence(run: Run, every: int | None, phases: int | None = None) -> None:
+    """Check that a model is for snapshots like these.
+
+    Args:
+        run: what is forecast.
+        every: gradient steps from one snapshot to the next in the training runs.
+        phases: snapshots in their iterations; None: that does not matter.
+
+    Raises:
+        ModelError: the run's are others.
+    """
+    got = run.info.cadence.every if run.info.cadence else None
+    longest = 0 if phases is None else int(run.phase.max()) + 1
+    if got != every or longest > (phases or 0):
+        raise ModelError(
+            "the model was trained on snapshots of another cadence",
+            expected=f"a snapshot every {every} gradient steps"
+            + (f", at most {phases} in an iteration" if phases else ""),
+            got=f"every {got}" + (f", {longest} in an iteration" if phases else ""),
+            where=run.path,
+            do="train a model on runs of this cadence",
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class TIPLConfig:
     """What a saved TIPL says of itself."""
@@ -132,15 +156,7 @@ class TIPL:
         return torch.cat(predicted, dim=1).cpu().numpy()
 
     def _check(self, run: Run, last: int) -> None:
-        every = run.info.cadence.every if run.info.cadence else None
-        if every != self.config.every:
-            raise ModelError(
-                "the model was trained on snapshots of another cadence",
-                expected=f"a snapshot every {self.config.every} gradient steps",
-                got=every,
-                where=run.path,
-                do="train a model on runs of this cadence",
-            )
+        check_cadence(run, self.config.every)
         if last > self.config.gpt.max_timestep:
             raise ModelError(
                 "the run is longer than the runs that the model was trained on, and time is an "

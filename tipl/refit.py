@@ -17,6 +17,7 @@ from typing import Any
 import weighttraj as wt
 from tipl.baselines import WNN, NinoMLP, Regression, TrainingConfig
 from tipl.baselines.nowcaster import Nowcaster
+from tipl.causal import Causal, CausalTrainConfig, train_causal
 from tipl.checks import NULL, TOLERANCE, Fit, check, run_like
 from tipl.evaluation.parts import fingerprint
 from tipl.forecast import TIPL, Forecaster
@@ -170,12 +171,29 @@ def _gate(old: Gate, runs: Sequence[Run], config: RefitConfig) -> Gate:
     )
 
 
+def _causal(old: Causal, runs: Sequence[Run], config: RefitConfig) -> Causal:
+    """A Transformer of the same sizes; a quarter of the walks choose when to stop."""
+    sizes = asdict(old.config.network)
+    del sizes["phases"]  # those of the walks
+    return train_causal(
+        CausalTrainConfig(
+            data=(as_dataset(runs, config.folder / "walks", validation=len(runs) // 4),),
+            out=config.folder / "refit",
+            n_batches=config.batches,
+            validate_every=max(1, config.batches // 20),
+            seed=config.seed,
+            **sizes | {"horizons": config.horizons},
+        )
+    )
+
+
 REFITS: dict[type, Callable[[Any, Sequence[Run], RefitConfig], Forecaster]] = {
     Regression: _regression,
     WNN: _nowcaster,
     NinoMLP: _nowcaster,
     TIPL: _tipl,
     Gate: _gate,
+    Causal: _causal,
 }
 """What fits each kind anew: the old forecaster, which says its sizes, the runs, and how much."""
 

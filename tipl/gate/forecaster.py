@@ -15,8 +15,7 @@ from torch import Tensor
 
 from tipl.baselines.files import ARRAYS, broken, read_config, write
 from tipl.baselines.horizons import rows_of
-from tipl.errors import ModelError
-from tipl.forecast import check_request
+from tipl.forecast import check_cadence, check_request
 from tipl.gate.features import Clock, Features, Structure, features
 from tipl.gate.history import histories
 from tipl.models.gate import GateConfig, GateNetwork
@@ -68,7 +67,7 @@ class Gate:
         sizes = self.config.network
         rows = rows_of(sizes.horizons, horizons, self.name)
         structure, clock = Structure.of(run.layout), Clock.of(run)
-        self._check(run, clock)
+        check_cadence(run, self.config.every, sizes.phases)
         out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
         self.network.eval()
         with one_torch_thread():
@@ -97,19 +96,6 @@ class Gate:
                 )
                 parts.append(moved)
         return torch.cat(parts).T
-
-    def _check(self, run: Run, clock: Clock) -> None:
-        every = run.info.cadence.every if run.info.cadence else None
-        phases = int(clock.phase.max()) + 1
-        if every != self.config.every or phases > self.config.network.phases:
-            raise ModelError(
-                "the model was trained on snapshots of another cadence",
-                expected=f"a snapshot every {self.config.every} gradient steps, at most "
-                f"{self.config.network.phases} in an iteration",
-                got=f"every {every}, {phases} in an iteration",
-                where=run.path,
-                do="train a model on runs of this cadence",
-            )
 
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""

@@ -81,7 +81,7 @@ class GPT(nn.Module):
         at_input, *at_blocks = keep or (None,) * len(self.config.dropped)
         x = self.embed_token((tokens - self.input_mean) / self.input_std)
         x = self.embed_norm(x + self.embed_timestep(timesteps))
-        hidden = _hidden(mask, self.config.n_head)
+        hidden = hidden_from(mask, self.config.n_head)
         # In the blocks all rows are one matrix: products take it as it is, forth and back.
         x = _drop(x.flatten(0, 1), at_input)  # (batch * window, n_embd)
         for i, block in enumerate(self.blocks):
@@ -150,7 +150,7 @@ class Block(nn.Module):
         return parts.transpose(1, 2).flatten(0, 1)
 
 
-def _hidden(
+def hidden_from(
     mask: Bool[Tensor, "batch window"], n_head: int
 ) -> Float[Tensor, "batch_head window window"]:
     """Minus infinity where a token must not look: at what comes later, and at padding."""

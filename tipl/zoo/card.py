@@ -267,7 +267,7 @@ def _errors(metrics: Metrics) -> str:
 
 def _commands(metrics: Metrics) -> str:
     commands = [metrics.results["command"]]
-    command = {"tipl": "train", "gate": "train-gate"}.get(metrics.kind)
+    command = {"tipl": "train", "gate": "train-gate", "causal": "train-causal"}.get(metrics.kind)
     if metrics.trained_on and command:
         data = " ".join(trained.data for trained in metrics.trained_on)
         given = " ".join(map(_option, metrics.settings.items()))

@@ -6,13 +6,19 @@ import json
 from pathlib import Path
 
 from tipl import baselines
+from tipl.causal import Causal
 from tipl.errors import ForecastError, ModelError
 from tipl.forecast import TIPL, Forecaster
 from tipl.gate import Gate
 
 MODELS = Path(__file__).with_name("models")
 """A folder for each released model; they come with the package."""
-KINDS: dict[str, type[Forecaster]] = {"tipl": TIPL, Gate.kind: Gate, **baselines.KINDS}
+KINDS: dict[str, type[Forecaster]] = {
+    "tipl": TIPL,
+    Gate.kind: Gate,
+    Causal.kind: Causal,
+    **baselines.KINDS,
+}
 """The class of each ``kind`` that config.json of a saved forecaster may name."""
 
 

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import weighttraj as wt
+from tipl.causal import Causal, CausalTrainConfig, train_causal
+from tipl.causal.forecaster import CausalModelConfig
+from tipl.causal.train import _CausalLearner
+from tipl.checks import NULL, TOLERANCE, causality, equivariance, random_walks, scale, skills
+from tipl.errors import ForecastError, ModelError, RepresentationError, TrainError
+from tipl.models.causal import CausalConfig, CausalGPT
+from tipl.refit import RefitConfig, refit_of
+
+HORIZONS = (1, 2, 5)
+SIZES = CausalConfig(
+    horizons=HORIZONS, rank=3, window=30, block_size=6, phases=4, n_layer=1, n_head=2, n_embd=16
+)
+
+
+@pytest.fixture(scope="module")
+def runs(small_dataset: Path) -> list[wt.Run]:
+    return wt.open(small_dataset).split("train").runs
+
+
+@pytest.fixture(scope="module")
+def config(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> CausalTrainConfig:
+    return CausalTrainConfig(
+        data=(small_dataset,),
+        out=tmp_path_factory.mktemp("causal") / "model",
+        horizons=HORIZONS,
+        starts=40,
+        n_batches=80,
+        batch_size=16,
+        learning_rate=3e-3,
+        validate_every=40,
+        rank=3,
+        window=30,
+        block_size=6,
+        n_layer=1,
+        n_head=2,
+        n_embd=16,
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(config: CausalTrainConfig) -> Causal:
+    return train_causal(config)
+
+
+def unseen(config: CausalTrainConfig) -> wt.Run:
+    return wt.open_dataset(config.data[0]).split("test").runs[0]
+
+
+def lively() -> Causal:
+    """A network whose forecasts are no copies, as its head is drawn."""
+    torch.manual_seed(0)
+    network = CausalGPT(SIZES)
+    torch.nn.init.normal_(network.head.weight, std=0.1)
+    return Causal(network, CausalModelConfig(network=SIZES, every=2))
+
+
+def test_before_training_it_is_persistence(runs: list[wt.Run]) -> None:
+    model = Causal(CausalGPT(SIZES), CausalModelConfig(network=SIZES, every=2))
+    forecast = model.forecast(runs[0], [0, 20], [1, 5])
+    assert np.array_equal(forecast, np.repeat(runs[0].weights[[0, 20]][:, None], 2, axis=1))
+
+
+def test_it_moves_within_the_directions_of_the_path(runs: list[wt.Run]) -> None:
+    weights = runs[0].weights[:].astype(np.float64)
+    moved = lively().forecast(runs[0], [25], [1, 2, 5])[0] - weights[25]
+    path = np.linalg.svd(weights[:26] - weights[25], full_matrices=False)[2][:3]
+    assert np.linalg.norm(moved) > 1e-4
+    np.testing.assert_allclose(moved @ path.T @ path, moved, atol=1e-6)
+
+
+def test_early_starts_are_copied(runs: list[wt.Run]) -> None:
+    forecast = lively().forecast(runs[0], [2, 3], [1])
+    assert np.array_equal(forecast[0, 0], runs[0].weights[2])
+    assert not np.array_equal(forecast[1, 0], runs[0].weights[3])
+
+
+def test_the_error_that_is_learnt_is_that_of_the_weights(
+    runs: list[wt.Run], config: CausalTrainConfig
+) -> None:
+    # So many draws find every start.
+    learner = _CausalLearner(replace(config, starts=2000), runs)
+    torch.nn.init.normal_(learner.network.head.weight, std=0.1)
+    examples = learner.gather([runs], lambda _: None)
+    model = Causal(learner.network, CausalModelConfig(network=learner.network.config, every=2))
+    ratios = []
+    for run in runs:
+        weights = run.weights[:]
+        for t in range(3, len(run) - 1):
+            for h in (h for h in HORIZONS if t + h < len(run)):
+                error = model.forecast(run, [t], [h])[0, 0] - weights[t + h]
+                ratios.append((error**2).sum() / ((weights[t + h] - weights[t]) ** 2).sum())
+    with torch.no_grad():
+        assert learner.error(examples).item() == pytest.approx(np.mean(ratios), rel=1e-3)
+
+
+def test_it_is_causal(runs: list[wt.Run], tmp_path: Path) -> None:
+    assert causality(lively(), runs[0], tmp_path, 20, HORIZONS)
+
+
+@pytest.mark.parametrize("symmetry", ["permutation", "sign"])
+def test_it_follows_symmetries(symmetry: str, runs: list[wt.Run], tmp_path: Path) -> None:
+    error = equivariance(lively(), runs[0], tmp_path, [9, 40], HORIZONS, symmetry=symmetry)
+    assert error < TOLERANCE
+
+
+def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
+    assert scale(lively(), runs[0], tmp_path, [9, 40], HORIZONS) < TOLERANCE
+
+
+def test_it_finds_nothing_in_random_walks(
+    trained: Causal, runs: list[wt.Run], tmp_path: Path
+) -> None:
+    walks = random_walks(runs[0], tmp_path, count=6)
+    fit = refit_of(trained, RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=40))
+    assert fit is not None
+    again = fit(walks[2:])
+    assert isinstance(again, Causal)
+    assert again.config.network == trained.config.network
+    assert (np.abs(skills(again, walks[:2], HORIZONS)) < NULL).all()
+
+
+def test_it_learns_and_a_finished_training_is_loaded(
+    trained: Causal, config: CausalTrainConfig
+) -> None:
+    assert (skills(trained, wt.open_dataset(config.data[0]).split("train").runs, [1]) > 0.05).all()
+    again = train_causal(config)
+    request = (unseen(config), [3, 30], [5, 1])
+    assert np.array_equal(again.forecast(*request), trained.forecast(*request))
+    assert again.name == "model"
+
+
+def test_what_does_not_fit_is_refused(
+    trained: Causal, config: CausalTrainConfig, tmp_path: Path
+) -> None:
+    run = unseen(config)
+    with pytest.raises(ForecastError, match=r"\[3\]"):
+        trained.forecast(run, [5], [3])
+    other = replace(trained, config=replace(trained.config, every=64))
+    with pytest.raises(ModelError, match="every 64 gradient steps"):
+        other.forecast(run, [5], [1])
+    with pytest.raises(TrainError, match="runs of more than 102 snapshots"):
+        train_causal(replace(config, out=tmp_path / "a", horizons=(1, 100)))
+    with pytest.raises(RepresentationError, match="a rank from 1 to 29"):
+        train_causal(replace(config, out=tmp_path / "b", rank=40))
+    (config.out / "model.safetensors").write_bytes(b"damaged")
+    with pytest.raises(ModelError, match="cannot be loaded"):
+        Causal.load(config.out)
