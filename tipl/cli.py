@@ -210,7 +210,7 @@ def _report(
 def _table(results: dict[str, Any]) -> Table:
     (overview,) = headline(results)
     table = Table(title=f"{results['data']}, {results['split']} runs: {', '.join(results['runs'])}")
-    table.add_column("forecaster")
+    table.add_column("forecaster", no_wrap=True)
     for column in overview.columns:
         table.add_column(column, justify="right")
     for name, cells in overview.rows:

@@ -22,7 +22,7 @@ from tipl.report.tables import MODE_NAMES, cell, label
 NEAR = 10
 """The paper's horizons end here."""
 TOLD = 3
-"""So many forecasters are told of where none is ours."""
+"""So many of the best baselines are told of where no model is ours."""
 
 
 def verdict(results: dict[str, Any]) -> str:
@@ -32,7 +32,7 @@ def verdict(results: dict[str, Any]) -> str:
 
 def paragraphs(results: dict[str, Any]) -> list[str]:
     """A paragraph for each model, and one about the baselines."""
-    names = models(results) or baselines(results)[:TOLD]
+    names = models(results) or best(results, baselines(results), SKILL, NEAR, TOLD)
     found = [" ".join(_sentences(results, name)) for name in names]
     return [*found, *_rivals(results)]
 
