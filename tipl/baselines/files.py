@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
+from safetensors.torch import load_file as load_tensors
+from torch import nn
 
 from tipl.errors import ModelError
 
@@ -18,6 +20,7 @@ CONFIG = "config.json"
 ARRAYS = "model.safetensors"
 
 T = TypeVar("T")
+N = TypeVar("N", bound=nn.Module)
 
 
 def write(
@@ -91,6 +94,20 @@ def read_arrays(path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> dict
     return arrays
 
 
+def load_network(network: N, path: str | Path) -> N:
+    """A network with the parameters that lie in a folder: each must be there, and no other.
+
+    Raises:
+        FileNotFoundError: there are none.
+        ModelError: they are damaged, or belong to something else.
+    """
+    try:
+        network.load_state_dict(load_tensors(Path(path) / ARRAYS), strict=True)
+    except (SafetensorError, RuntimeError) as error:
+        raise broken(path, error) from error
+    return network
+
+
 def broken(path: str | Path, why: object) -> ModelError:
     """The error of a folder that holds no such forecaster."""
     return ModelError(
@@ -102,4 +119,13 @@ def broken(path: str | Path, why: object) -> ModelError:
     )
 
 
-__all__ = ["ARRAYS", "CONFIG", "broken", "read_arrays", "read_config", "read_settings", "write"]
+__all__ = [
+    "ARRAYS",
+    "CONFIG",
+    "broken",
+    "load_network",
+    "read_arrays",
+    "read_config",
+    "read_settings",
+    "write",
+]

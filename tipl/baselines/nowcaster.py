@@ -17,10 +17,9 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
-from tipl.baselines.files import ARRAYS, broken, read_config, write
+from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import HORIZONS, fitted, rows_of
 from tipl.baselines.networks import (
     Examples,
@@ -153,12 +152,7 @@ class Nowcaster(ABC):
             ModelError: the files are another's, or damaged.
         """
         config = read_config(path, cls.kind, NowcasterConfig)
-        try:
-            network = cls.build(config)
-            network.load_state_dict(load_file(Path(path) / ARRAYS), strict=True)
-        except (SafetensorError, RuntimeError) as error:
-            raise broken(path, error) from error
-        return cls(network, config)
+        return cls(load_network(cls.build(config), path), config)
 
 
 class NowcasterFit(Generic[N]):

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float32
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
-from tipl.baselines.files import ARRAYS, broken, read_config, write
+from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.causal.view import SCALE_STEPS, bases_of, local_scale, view
 from tipl.forecast import check_cadence, check_request
@@ -97,11 +96,7 @@ class Causal:
             ModelError: the files are another's, or damaged.
         """
         config = read_config(path, cls.kind, CausalModelConfig)
-        try:
-            network = CausalGPT(config.network)
-            network.load_state_dict(load_file(Path(path) / ARRAYS), strict=True)
-        except (SafetensorError, RuntimeError) as error:
-            raise broken(path, error) from error
+        network = load_network(CausalGPT(config.network), path)
         return cls(network, config, Path(path).resolve().name)
 
 

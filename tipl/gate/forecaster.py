@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
-from tipl.baselines.files import ARRAYS, broken, read_config, write
+from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.forecast import check_cadence, check_request
 from tipl.gate.features import Clock, Features, Structure, features
@@ -111,11 +110,7 @@ class Gate:
             ModelError: the files are another's, or damaged.
         """
         config = read_config(path, cls.kind, GateModelConfig)
-        try:
-            network = GateNetwork(config.network)
-            network.load_state_dict(load_file(Path(path) / ARRAYS), strict=True)
-        except (SafetensorError, RuntimeError) as error:
-            raise broken(path, error) from error
+        network = load_network(GateNetwork(config.network), path)
         return cls(network, config, Path(path).resolve().name)
 
 
