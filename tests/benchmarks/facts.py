@@ -9,6 +9,7 @@ draws datasets/<id>/returns.svg.
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 import matplotlib as mpl
@@ -41,6 +42,7 @@ def render(dataset: wt.Dataset) -> str:
     """Sizes, versions, and quartiles of the returns over runs."""
     steps, by_mode = returns_of(dataset)
     run = dataset.runs[0]
+    trainer = asdict(run.info.algorithm)["library"]
     splits = [f"{len(dataset.split(name).runs)} {name}" for name in ("train", "validation", "test")]
     size = sum(file.stat().st_size for file in dataset.path.rglob("*") if file.is_file())
     provenances = {tuple(sorted(r.info.provenance.packages.items())) for r in dataset}
@@ -51,7 +53,7 @@ def render(dataset: wt.Dataset) -> str:
         f"- {len(dataset.runs)} runs: {', '.join(splits)}",
         f"- {len(run):,} snapshots of {run.layout.size} parameters each; "
         f"{size / 1e6:.1f} MB in all",
-        f"- made by {run.info.algorithm.library}, on {run.info.provenance.platform}, "
+        f"- made by {trainer}, on {run.info.provenance.platform}, "
         f"{run.info.provenance.cpu}, with {'; '.join(versions)}",
         "",
         "| return after | "

@@ -152,6 +152,7 @@ def test_what_does_not_fit_is_refused(
         train_causal(replace(config, out=tmp_path / "a", horizons=(1, 100)))
     with pytest.raises(RepresentationError, match="a rank from 1 to 29"):
         train_causal(replace(config, out=tmp_path / "b", rank=40))
-    (config.out / "model.safetensors").write_bytes(b"damaged")
+    trained.save(tmp_path / "copy")
+    (tmp_path / "copy/model.safetensors").write_bytes(b"damaged")
     with pytest.raises(ModelError, match="cannot be loaded"):
-        Causal.load(config.out)
+        Causal.load(tmp_path / "copy")
