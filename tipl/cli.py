@@ -23,6 +23,7 @@ try:
     from tipl.baselines import HORIZONS, TrainingConfig
     from tipl.causal import CausalTrainConfig, train_causal
     from tipl.distributed import rank_here
+    from tipl.drift import DriftConfig, train_drift
     from tipl.evaluation import EvaluateConfig
     from tipl.gate import GateTrainConfig, train_gate
     from tipl.refit import check_model
@@ -59,6 +60,15 @@ def _train_gate(config: GateTrainConfig) -> None:
     signal.signal(signal.SIGTERM, _stop)
     train_gate(config, console=console)
     print(f"model in {config.out}")
+
+
+@app.command(name="train-drift")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _train_drift(config: DriftConfig) -> None:
+    """Choose how far to go along a tipl-gate's forecast, by the returns of validation runs."""
+    signal.signal(signal.SIGTERM, _stop)
+    drift = train_drift(config, console=console)
+    print(f"model in {config.out}: {drift.amplitudes}")
 
 
 @app.command(name="train-causal")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from tipl.baselines import WNN, NinoMLP, Regression, TrainingConfig
 from tipl.baselines.nowcaster import Nowcaster
 from tipl.causal import Causal, CausalTrainConfig, train_causal
 from tipl.checks import NULL, TOLERANCE, Fit, check, run_like
+from tipl.drift import Drift
 from tipl.evaluation.parts import fingerprint
 from tipl.forecast import TIPL, Forecaster
 from tipl.gate import Gate, GateTrainConfig, train_gate
@@ -171,6 +172,13 @@ def _gate(old: Gate, runs: Sequence[Run], config: RefitConfig) -> Gate:
     )
 
 
+def _drift(old: Drift, runs: Sequence[Run], config: RefitConfig) -> Drift:
+    """Another gate, and the same amplitudes: walks have no returns to choose others by."""
+    horizons = tuple(h for h in config.horizons if h in old.amplitudes)
+    gate = _gate(old.gate, runs, replace(config, horizons=horizons))
+    return Drift(gate, {h: old.amplitudes[h] for h in horizons})
+
+
 def _causal(old: Causal, runs: Sequence[Run], config: RefitConfig) -> Causal:
     """A Transformer of the same sizes; a quarter of the walks choose when to stop."""
     sizes = asdict(old.config.network)
@@ -193,6 +201,7 @@ REFITS: dict[type, Callable[[Any, Sequence[Run], RefitConfig], Forecaster]] = {
     NinoMLP: _nowcaster,
     TIPL: _tipl,
     Gate: _gate,
+    Drift: _drift,
     Causal: _causal,
 }
 """What fits each kind anew: the old forecaster, which says its sizes, the runs, and how much."""

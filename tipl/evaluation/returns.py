@@ -28,10 +28,11 @@ class Player:
         run: the run.
         episodes: for each policy, the same seeds for all.
         seed: of the first.
+        modes: how they act, of ``MODES``.
     """
 
-    def __init__(self, run: Run, episodes: int, seed: int) -> None:
-        self._run = run
+    def __init__(self, run: Run, episodes: int, seed: int, *, modes: Sequence[str] = MODES) -> None:
+        self._run, self.modes = run, tuple(modes)
         self._evaluator = Evaluator(env_of(run), episodes=episodes, seed=seed)
         self._known: dict[tuple[bool, bytes], float] = {}
 
@@ -47,7 +48,7 @@ class Player:
         starts: Int[np.ndarray, " policy"],
         tick: Tick = lambda _: None,
     ) -> Float[np.ndarray, "mode policy"]:
-        """Mean returns in each of ``MODES``.
+        """Mean returns in each mode.
 
         Args:
             policies: to be played.
@@ -57,7 +58,7 @@ class Player:
         held = policies.with_weights(hold_log_std(self._run, policies.weights, starts))
         arms = {"sampled": policies, "held": held, "deterministic": policies}
         found = []
-        for mode in MODES:
+        for mode in self.modes:
             found.append(self._play(arms[mode], deterministic=mode == "deterministic"))
             tick(len(policies))
         return np.stack(found)
@@ -83,7 +84,7 @@ def true_returns(
     now = player.returns(load_policies(run, starts), starts, tick)
     policies = load_policies(run, (starts[:, None] + np.asarray(horizons)).ravel())
     later = player.returns(policies, np.repeat(starts, len(horizons)), tick)
-    return {"now": now, "later": later.reshape(len(MODES), len(starts), len(horizons))}
+    return {"now": now, "later": later.reshape(len(now), len(starts), len(horizons))}
 
 
 def forecast_returns(
@@ -107,7 +108,7 @@ def forecast_returns(
     rows = (starts[:, None] + np.asarray(horizons)).ravel() if is_floor(forecaster) else at
     policies = load_policies(run, rows).with_weights(weights.reshape(len(at), -1))
     found = player.returns(policies, at, tick)
-    return {"forecast": found.reshape(len(MODES), len(starts), len(horizons))}
+    return {"forecast": found.reshape(len(found), len(starts), len(horizons))}
 
 
 def is_floor(forecaster: Any) -> bool:

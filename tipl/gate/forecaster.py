@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -52,11 +52,24 @@ class Gate:
     kind = "gate"
     causal = True
 
-    @torch.no_grad()
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
         """phi_t and what the network adds to it.
+
+        Raises:
+            ForecastError: it was not trained for such a horizon.
+            ModelError: the run has another cadence, or longer iterations.
+        """
+        out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
+        for place, weights, moved in self.moves(run, starts, horizons):
+            out[place] = weights + moved
+        return out
+
+    def moves(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Iterator[tuple[int, Float32[np.ndarray, " param"], Float32[np.ndarray, "horizon param"]]]:
+        """The forecast in parts: for each start its place among them, phi_t, and what is added.
 
         Raises:
             ForecastError: it was not trained for such a horizon.
@@ -67,14 +80,13 @@ class Gate:
         rows = rows_of(sizes.horizons, horizons, self.name)
         structure, clock = Structure.of(run.layout), Clock.of(run)
         check_cadence(run, self.config.every, sizes.phases)
-        out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
         self.network.eval()
         with one_torch_thread():
             for place, history in histories(run, starts, sizes.lags, sizes.betas):
-                seen = features(history, structure, clock, sizes)
-                moved = self.displacements(seen, structure, rows)
-                out[place] = (history.weights + moved).numpy()
-        return out
+                with torch.no_grad():
+                    seen = features(history, structure, clock, sizes)
+                    moved = self.displacements(seen, structure, rows)
+                yield place, history.weights.numpy(), moved.numpy()
 
     def displacements(
         self, seen: Features, structure: Structure, rows: list[int]

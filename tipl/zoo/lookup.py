@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tipl import baselines
 from tipl.causal import Causal
+from tipl.drift import Drift
 from tipl.errors import ForecastError, ModelError
 from tipl.forecast import TIPL, Forecaster
 from tipl.gate import Gate
@@ -17,6 +18,7 @@ KINDS: dict[str, type[Forecaster]] = {
     "tipl": TIPL,
     Gate.kind: Gate,
     Causal.kind: Causal,
+    Drift.kind: Drift,
     **baselines.KINDS,
 }
 """The class of each ``kind`` that config.json of a saved forecaster may name."""

@@ -37,7 +37,17 @@ LINES = 100
 _ARRAYS = "model.safetensors"
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]*")
 _OF_THE_SPEED = ("batches_per_s",)
-_OF_THE_MACHINE = ("data", "out", "runs", "device", "threads", "compile")
+_OF_THE_MACHINE = (
+    "data",
+    "out",
+    "runs",
+    "gate",
+    "chosen_on",
+    "validation",
+    "device",
+    "threads",
+    "compile",
+)
 """Settings of a training that say nothing of the model."""
 
 
@@ -188,9 +198,9 @@ def _checks(file: Path, mark: str, name: str) -> dict[str, Any]:
 
 def _trained_on(settings: dict[str, Any]) -> tuple[TrainedOn, ...]:
     """The runs that a training's settings name: of one data set, or of several in order."""
-    if not {"data", "runs"} <= settings.keys():
+    data, runs = settings.get("data"), settings.get("runs")
+    if data is None or runs is None:
         return ()
-    data, runs = settings["data"], settings["runs"]
     if isinstance(data, str):
         data, runs = [data], [runs]
     return tuple(_of_one(*pair) for pair in zip(data, runs, strict=True))

@@ -1,0 +1,10 @@
+"""tipl-drift: the direction of tipl-gate, as far as it serves the return.
+
+``forecaster`` is the model; ``train`` chooses how far, by the returns of forecast policies on
+validation runs.
+"""
+
+from tipl.drift.forecaster import Drift
+from tipl.drift.train import DriftConfig, train_drift
+
+__all__ = ["Drift", "DriftConfig", "train_drift"]

@@ -1,0 +1,97 @@
+"""tipl-gate with longer steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+from safetensors.torch import save_file
+
+from tipl.baselines.files import ARRAYS, broken, load_network, read_config, write
+from tipl.baselines.horizons import rows_of
+from tipl.gate.forecaster import Gate, GateModelConfig
+from tipl.models.gate import GateConfig, GateNetwork
+from weighttraj import Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriftModelConfig:
+    """What a saved one says of itself."""
+
+    network: GateConfig
+    """Sizes of the network."""
+    every: int | None
+    """Gradient steps from one snapshot to the next in the training runs."""
+    amplitudes: dict[str, float]
+    """What the displacement of a horizon is multiplied by. JSON has no numbers as keys."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """phi_t + a_h d_h: the displacement d_h that tipl-gate forecasts, a_h times as long.
+
+    A least-squares forecast is short, since it shrinks what it is not sure of: the mean of many
+    ways that training may go. The return rises along that mean, and further than it reaches. So a_h
+    is chosen by returns, not by errors of weights, which get worse. ``log_std``, the exploration
+    noise, moves as tipl-gate says: a_h is chosen with it held. Ours.
+    """
+
+    gate: Gate
+    """Where to."""
+    amplitudes: dict[int, float]
+    """How far: a_h of each horizon."""
+    name: str = "tipl-drift"
+    """Name in tables and figures: of the folder that it was loaded from."""
+    kind = "drift"
+    causal = True
+
+    def forecast(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Float32[np.ndarray, "start horizon param"]:
+        """phi_t and the longer displacement.
+
+        Raises:
+            ForecastError: there is no amplitude for such a horizon.
+            ModelError: the run has another cadence, or longer iterations.
+        """
+        rows_of(list(self.amplitudes), horizons, self.name)
+        factors = np.ones((len(horizons), run.layout.size), np.float32)
+        factors *= np.array([[self.amplitudes[h]] for h in horizons], np.float32)
+        for param in run.layout.params:
+            if param.name == "log_std":
+                factors[:, param.slice] = 1
+        out = np.empty((len(starts), *factors.shape), np.float32)
+        for place, weights, moved in self.gate.moves(run, starts, horizons):
+            out[place] = weights + factors * moved
+        return out
+
+    def save(self, path: str | Path) -> None:
+        """Write config.json and model.safetensors."""
+        amplitudes = {str(h): a for h, a in self.amplitudes.items()}
+        write(path, {"kind": self.kind, **asdict(self.gate.config), "amplitudes": amplitudes})
+        save_file(self.gate.network.state_dict(), Path(path) / ARRAYS)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Drift:
+        """Read a saved one; every parameter must be there.
+
+        Raises:
+            FileNotFoundError: there is no forecaster in the folder.
+            ModelError: the files are another's, or damaged.
+        """
+        config = read_config(path, cls.kind, DriftModelConfig)
+        known = {str(h): h for h in config.network.horizons}
+        if not config.amplitudes.keys() <= known.keys():
+            raise broken(
+                path, f"amplitudes of horizons that the network does not forecast: {known}"
+            )
+        network = load_network(GateNetwork(config.network), path)
+        gate = Gate(network, GateModelConfig(network=config.network, every=config.every))
+        amplitudes = {known[h]: a for h, a in config.amplitudes.items()}
+        return cls(gate, amplitudes, Path(path).resolve().name)
+
+
+__all__ = ["Drift", "DriftModelConfig"]
