@@ -320,12 +320,12 @@ def test_the_page_stands_alone_and_says_who_wins(
     results: dict[str, Any], config: EvaluateConfig
 ) -> None:
     page = (config.out / "report.html").read_text()
-    assert page.count("<svg") == 4
+    assert page.count("<svg") == 5
     assert "TIPL loses to copying the last weights" in page
     for outside in ('src="http', 'href="http', "<script", "@import"):
         assert outside not in page
     pictures = list(config.out.glob("*.png"))
-    assert len(pictures) == 4
+    assert len(pictures) == 5
     assert all(picture.stat().st_size > 10_000 for picture in pictures)
 
 

@@ -94,7 +94,7 @@ def test_a_line_below_the_frame_is_named(demo: dict[str, Any]) -> None:
 
 def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
     assert titles(demo) == list(figures(demo))
-    assert len(titles(demo)) == 4
+    assert len(titles(demo)) == 5
     assert titles(demo | {"modes": []}) == ["Skill against horizon"]
 
 
@@ -174,7 +174,7 @@ def test_every_section_is_written_in_its_place(demo: dict[str, Any], tmp_path: P
     assert text.startswith("# A page\n\nProse.\n")
     assert text.count("\nMore.\n") == len(SECTIONS) + 1
     pictures = sorted(path.name for path in (tmp_path / "results").iterdir())
-    assert len(pictures) == 4
+    assert len(pictures) == 5
     assert all(f"](results/{name})" in text for name in pictures)
     assert rewrite(text, "results", str(DEMO), partial(render, demo, DEMO)) == text
     changed = demo | {"command": "tipl evaluate something else"}

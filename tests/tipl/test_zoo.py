@@ -326,6 +326,31 @@ def test_what_was_not_measured_leaves_no_heading(
     assert "![" not in text
 
 
+def test_the_card_of_amplitudes_shows_what_chose_them(
+    trained: Path, zoo: Path, results: Path
+) -> None:
+    release(trained, "tipl-small", results=results)
+    metrics = replace(
+        metrics_of("tipl-small"),
+        kind="drift",
+        settings={"episodes": 3, "of_gate": {"width": 16, "horizons": [1, 5]}},
+        log=[
+            {"amplitude": 1.5, "gain_1": 0.25, "gain_5": 1.0},
+            {"amplitude": 8, "gain_1": 2.0, "gain_5": -0.5},
+        ],
+    )
+    training, commands = (facts(metrics, section) for section in ("training", "commands"))
+    assert "| amplitude | h = 1 | h = 5 |" in training
+    assert "| 1.5 | 0.25 | **1.00** |" in training
+    assert "| 8 | **2.00** | -0.50 |" in training
+    assert "Settings of the network: width 16" in training
+    assert "![" not in training
+    _, gate, drift, judged, _ = commands.splitlines()
+    assert gate == "tipl train-gate --data small --out GATE --width 16 --horizons 1 5"
+    assert drift == "tipl train-drift --gate GATE --data small --out FOLDER --episodes 3"
+    assert judged == metrics.results["command"]
+
+
 def test_cards_refuse_what_they_cannot_say(
     trained: Path, zoo: Path, results: Path, tmp_path: Path
 ) -> None:

@@ -80,7 +80,7 @@ def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift
         "out": str(config.out),
         **_trained_on(config.gate),
     }
-    keep_settings(config.out, settings, ("out", "data", "chosen_on"))
+    keep_settings(config.out, settings, ("out", "data", "chosen_on", "of_gate"))
     parts, factors = Parts(config.out / "parts"), tuple(sorted(config.amplitudes))
     console = console or Console(quiet=True)
     columns = (
@@ -137,10 +137,12 @@ def _between(gate: Gate, horizons: Sequence[int], best: Sequence[float]) -> dict
 
 
 def _trained_on(gate: Path) -> dict[str, Any]:
-    """The data sets and runs that the network was trained on, where its folder says so."""
+    """The data sets and runs that the network was trained on, and how, where its folder says so."""
     file = gate / "train.json"
     settings = json.loads(file.read_text()) if file.exists() else {}
-    return {name: settings.get(name) for name in ("data", "runs")}
+    data, runs = settings.pop("data", None), settings.pop("runs", None)
+    settings.pop("out", None)
+    return {"data": data, "runs": runs, "of_gate": settings}
 
 
 def _check(config: DriftConfig, runs: Sequence[wt.Run]) -> None:

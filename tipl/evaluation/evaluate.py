@@ -77,6 +77,7 @@ def evaluate(
         "version": dataset.info.version,
         "split": config.split,
         "runs": [run.id for run in runs],
+        "env_steps_per_snapshot": _env_steps_of(runs[0]),
         "horizons": list(config.horizons),
         "return_horizons": list(config.return_horizons) if config.learning_starts else [],
         "modes": list(MODES) if config.learning_starts else [],
@@ -105,6 +106,12 @@ def evaluate(
     (config.out / "results.json").write_text(json.dumps(results, indent=1))
     write_report(results, config.out)
     return results
+
+
+def _env_steps_of(run: wt.Run) -> float:
+    """Environment steps from one snapshot to the next, a mean over the run."""
+    first, last = (int(run["index/num_timesteps"][i]) for i in (0, -1))
+    return (last - first) / (len(run) - 1)
 
 
 def _check_runs(runs: Sequence[wt.Run], config: EvaluateConfig) -> None:

@@ -59,6 +59,7 @@ def _plans(results: dict[str, Any]) -> dict[str, Callable[[], Figure]]:
     found = {"Skill against horizon": partial(skill_figure, results)}
     if results["modes"]:
         found["Inference gain against horizon"] = partial(gain_figure, results)
+        found["Return of one forecast"] = partial(return_figure, results)
         found |= {
             f"The paper's figure, {MODE_NAMES[mode]}": partial(paper_figure, results, mode)
             for mode in results["modes"]
@@ -103,6 +104,37 @@ def gain_figure(results: dict[str, Any]) -> Figure:
         _label(axes, "horizon h, snapshots", "inference gain" if axes is all_axes[0] else "")
     _legend(fig)
     return fig
+
+
+def return_figure(results: dict[str, Any]) -> Figure:
+    """Returns of forecast policies beside the environment steps that PPO takes instead.
+
+    Interquartile means over starts in the learning phase of all runs. A forecast takes no step.
+    """
+    fig = Figure(figsize=(12, 4.6), layout="constrained")
+    all_axes = fig.subplots(1, 3, sharey=True)
+    each = results.get("env_steps_per_snapshot")
+    for axes, mode in zip(all_axes, results["modes"], strict=True):
+        for name, style in styles(results).items():
+            rows = rows_of(results["forecasters"][name], ("gain", mode))
+            if not results["forecasters"][name]["floor"]:
+                axes.plot(*_curve(rows, "forecast", each), **style)
+        trained = {"color": "black", "ls": ":", "lw": 2, "zorder": 4, "label": "PPO itself"}
+        axes.plot(
+            *_curve(rows_of(results["forecasters"][COPY], ("gain", mode)), "later", each), **trained
+        )
+        axes.set_xscale("log")
+        axes.set_title(MODE_NAMES[mode], fontsize=10)
+        x = "horizon h, snapshots" if each is None else "environment steps that PPO takes meanwhile"
+        _label(axes, x, "return" if axes is all_axes[0] else "")
+    _legend(fig)
+    return fig
+
+
+def _curve(rows: list[Row], key: str, each: float | None) -> tuple[list[float], list[float]]:
+    """Returns against environment steps, or against snapshots where these are not known."""
+    known = [row for row in rows if row.get(key) is not None]
+    return [row["h"] * (each or 1) for row in known], [row[key] for row in known]
 
 
 def paper_figure(results: dict[str, Any], mode: str) -> Figure:

@@ -33,6 +33,8 @@ from tipl.zoo.metrics import Metrics, read_metrics
 
 HEADLINE = ("skill, h = 1", "skill, h = 10", "gain, h = 50")
 """Columns that sum a model up."""
+_COMMANDS = {"tipl": "train", "gate": "train-gate", "causal": "train-causal"}
+"""What trains each kind."""
 _TESTS = {
     "null": "random walks: skill is 0",
     "causality": "the future moves no bit",
@@ -72,7 +74,7 @@ def write_card(name: str, out: Path) -> Path:
     card = out / f"{name}.md"
     text = card.read_text() if card.exists() else new_card(metrics)
     card.write_text(refreshed(text, metrics))
-    if metrics.log:
+    if metrics.log and metrics.kind != "drift":
         (out / f"{name}.svg").write_text(svg(training_figure(metrics)))
     return card
 
@@ -238,11 +240,41 @@ def _training(metrics: Metrics) -> str:
     if not metrics.settings and not metrics.log:
         return ""
     lines = ["## Training"]
-    if metrics.settings:
-        lines += ["", "Settings: " + ", ".join(f"{k} {v}" for k, v in metrics.settings.items())]
-    if metrics.log:
+    for what, settings in _settings(metrics).items():
+        if settings:
+            told = ", ".join(f"{k} {v}" for k, v in settings.items())
+            lines += ["", f"Settings{what}: {told}"]
+    if metrics.kind == "drift":
+        lines += ["", *_amplitudes(metrics)]
+    elif metrics.log:
         lines += ["", _errors(metrics), "", f"![error against batches]({metrics.name}.svg)"]
     return "\n".join(lines)
+
+
+def _settings(metrics: Metrics) -> dict[str, dict[str, Any]]:
+    """Of the training, and of that of the network before it."""
+    own = dict(metrics.settings)
+    before = own.pop("of_gate", {})
+    return {" of the network": before, " of the amplitudes": own} if before else {"": own}
+
+
+def _amplitudes(metrics: Metrics) -> list[str]:
+    """Gains on validation runs, of each amplitude at each horizon; the highest are bold."""
+    horizons = [key.removeprefix("gain_") for key in metrics.log[0] if key.startswith("gain_")]
+    best = {h: max(line[f"gain_{h}"] for line in metrics.log) for h in horizons}
+    lines = [
+        "Inference gain on validation runs, with the exploration noise of the start:",
+        "",
+        "| amplitude | " + " | ".join(f"h = {h}" for h in horizons) + " |",
+        "|---:|" + "---:|" * len(horizons),
+    ]
+    for line in metrics.log:
+        cells = (
+            f"**{gain:.2f}**" if (gain := line[f"gain_{h}"]) == best[h] else f"{gain:.2f}"
+            for h in horizons
+        )
+        lines.append(f"| {line['amplitude']:g} | {' | '.join(cells)} |")
+    return lines
 
 
 def _errors(metrics: Metrics) -> str:
@@ -266,13 +298,18 @@ def _errors(metrics: Metrics) -> str:
 
 
 def _commands(metrics: Metrics) -> str:
-    commands = [metrics.results["command"]]
-    command = {"tipl": "train", "gate": "train-gate", "causal": "train-causal"}.get(metrics.kind)
-    if metrics.trained_on and command:
-        data = " ".join(trained.data for trained in metrics.trained_on)
-        given = " ".join(map(_option, metrics.settings.items()))
-        commands.insert(0, f"tipl {command} --data {data} --out FOLDER {given}")
-    return "\n".join(["```bash", *commands, "```"])
+    commands = []
+    given = {what: " ".join(map(_option, x.items())) for what, x in _settings(metrics).items()}
+    data = " ".join(trained.data for trained in metrics.trained_on)
+    if metrics.trained_on and metrics.kind == "drift":
+        of_network, of_amplitudes = given.values()
+        commands += [
+            f"tipl train-gate --data {data} --out GATE {of_network}",
+            f"tipl train-drift --gate GATE --data {data} --out FOLDER {of_amplitudes}",
+        ]
+    elif metrics.trained_on and metrics.kind in _COMMANDS:
+        commands.append(f"tipl {_COMMANDS[metrics.kind]} --data {data} --out FOLDER {given['']}")
+    return "\n".join(["```bash", *commands, metrics.results["command"], "```"])
 
 
 def _option(setting: tuple[str, Any]) -> str:
