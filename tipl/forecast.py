@@ -110,6 +110,8 @@ class TIPLConfig:
     """Sizes of the network."""
     every: int | None
     """Gradient steps from one snapshot to the next in the training runs."""
+    parameters: int | None = None
+    """Of a policy in the training runs; None: not said."""
     kind: str = "tipl"
     """Which forecaster this is."""
 
@@ -130,7 +132,8 @@ class TIPL:
         """Forecasts by feeding each prediction back as the next token.
 
         Raises:
-            ModelError: the run has another cadence, or goes on after the last time embedding.
+            ModelError: the run has another cadence, policies of another size, or goes on after the
+                last time embedding.
         """
         check_request(run, starts, horizons)
         self._check(run, max(starts) + max(horizons))
@@ -157,6 +160,15 @@ class TIPL:
 
     def _check(self, run: Run, last: int) -> None:
         check_cadence(run, self.config.every)
+        if self.config.parameters not in (None, run.layout.size):
+            raise ModelError(
+                "the model was trained on policies of another structure",
+                expected=f"policies of {self.config.parameters:,} parameters",
+                got=f"{run.layout.size:,}",
+                where=run.path,
+                do="train a model on such runs, or use one that serves policies of any size: "
+                "tipl-gate",
+            )
         if last > self.config.gpt.max_timestep:
             raise ModelError(
                 "the run is longer than the runs that the model was trained on, and time is an "

@@ -23,6 +23,8 @@ class Prepared:
     """Runs of the validation split, to log an error on; empty where there is none."""
     every: int | None
     """Gradient steps from one snapshot to the next."""
+    parameters: int
+    """Of one policy."""
     longest: int
     """Snapshots of the longest training run."""
     digests: dict[str, str]
@@ -63,6 +65,7 @@ def prepare(data: Path, *, rank: int, window: int) -> Prepared:
         # The model has no time embedding for what comes after the longest training run.
         validation=[_cut(_tokens(run, rank), longest) for run in held_out],
         every=_every(train[0]),
+        parameters=train[0].layout.size,
         longest=longest,
         digests={run.id: digest_of(run) for run in train},
     )

@@ -150,7 +150,7 @@ def _model_config(config: TrainConfig, prepared: Prepared) -> TIPLConfig:
         n_embd=config.n_embd,
         dropout=config.dropout,
     )
-    return TIPLConfig(gpt=gpt, every=prepared.every)
+    return TIPLConfig(gpt=gpt, every=prepared.every, parameters=prepared.parameters)
 
 
 def _sampler(config: TrainConfig, prepared: Prepared) -> TokenSampler:

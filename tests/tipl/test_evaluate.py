@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import weighttraj as wt
+from tests.small import SMALL_RECIPE
 from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evaluate, load, train
 from tipl.errors import EvaluateError
 from tipl.evaluation import measure
@@ -20,6 +21,9 @@ from tipl.evaluation.statistics import Bootstrap, interquartile_mean, mean, rati
 from tipl.evaluation.summary import Summary
 from tipl.evaluation.weights import squared_errors
 from tipl.report import verdict
+from weighttraj.collect import collect
+from weighttraj.collect.recipe import Seeds
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import ReturnsConfig, fill_returns
 from weighttraj.policies import evaluate as play
 
@@ -379,6 +383,33 @@ def test_runs_without_returns_are_refused(small_dataset: Path, tmp_path: Path) -
     with pytest.raises(EvaluateError, match=r"(?s)no returns.*--learning-starts 0"):
         evaluate([], config)
     assert not (tmp_path / "out").exists()
+
+
+def test_runs_without_observations_are_refused(tmp_path: Path) -> None:
+    recipe = replace(SMALL_RECIPE, store=replace(SMALL_RECIPE.store, probe_observations=0))
+    collect(replace(recipe, seeds=Seeds(train=[0], test=[1])), tmp_path / "data")
+    small = SMALL | {"learning_starts": 0}
+    config = EvaluateConfig(data=tmp_path / "data", out=tmp_path / "out", **small)
+    with pytest.raises(EvaluateError, match=r"(?s)no stored observations.*--function-starts 0"):
+        evaluate([], config)
+
+
+def test_runs_of_other_policies_are_refused(small_dataset: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(small_dataset, data)
+    other = replace(
+        SMALL_RECIPE,
+        ppo=replace(SMALL_RECIPE.ppo, net_arch=(4,)),
+        seeds=Seeds(train=[7], test=[8]),
+    )
+    collect(other, tmp_path / "other")
+    (entry,) = (run for run in read_dataset_info(tmp_path / "other").runs if run.seed == 8)
+    shutil.copy(tmp_path / "other" / entry.path, data / entry.path)
+    info = read_dataset_info(data)
+    write_dataset_info(data, replace(info, runs=(*info.runs, entry)))
+    config = EvaluateConfig(data=data, out=tmp_path / "out", **SMALL)
+    with pytest.raises(EvaluateError, match=r"(?s)different structure.*122 parameters.*26 param"):
+        evaluate([], config)
 
 
 def test_equal_names_are_refused(model: Path, config: EvaluateConfig) -> None:

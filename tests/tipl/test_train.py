@@ -234,3 +234,6 @@ def test_runs_that_do_not_fit_the_model_are_refused(config: TrainConfig) -> None
     other = TIPL(model.model, replace(model.config, every=64))
     with pytest.raises(ModelError, match="another cadence"):
         other.forecast(run, [1], [1])
+    other = TIPL(model.model, replace(model.config, parameters=7))
+    with pytest.raises(ModelError, match=r"another structure(.|\n)*of 7 parameters(.|\n)*122"):
+        other.forecast(run, [1], [1])
