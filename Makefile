@@ -2,8 +2,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := data/demo
+RELEASED := inverted-pendulum-v4-ppo-v1
 
-.PHONY: demo test lint bench stress setup clean-demo
+.PHONY: demo test lint bench results stress setup clean-demo
 
 setup: .venv/installed
 
@@ -43,6 +44,12 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_learning.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_recipes.py --save
 	$(BIN)/python tests/benchmarks/results.py
+
+results: setup ## judge the zoo and the baselines, write docs/results.md: two hours
+	$(BIN)/tipl fit $(RELEASED) --out data/results/ladder
+	$(BIN)/tipl evaluate tipl-inverted-pendulum-v4 tipl-gate-inverted-pendulum-v4 tipl-drift-inverted-pendulum-v4 data/results/ladder/* --data $(RELEASED) --out data/results/full --return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1 --workers 2
+	cp data/results/full/results.json docs/results/$(RELEASED).json
+	$(BIN)/tipl report docs/results/$(RELEASED).json --into docs/results.md
 
 stress: setup ## kill, flip, delete, fuzz: about an hour
 	$(BIN)/python -W ignore tests/benchmarks/stress_format.py
