@@ -54,6 +54,7 @@ __all__ = [
     "pack",
     "policies",
     "publish",
+    "registry",
     "repair",
     "seal",
     "store_returns",
@@ -61,7 +62,7 @@ __all__ = [
     "verify",
 ]
 
-_ROOMS = ("collect", "load", "policies", "publish")
+_ROOMS = ("collect", "load", "policies", "publish", "registry")
 _HDF5 = ("export_hdf5", "import_hdf5")
 
 

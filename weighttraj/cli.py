@@ -12,8 +12,11 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
+from rich.prompt import Confirm
+from rich.table import Table
 
 import weighttraj as wt
+from weighttraj import registry
 from weighttraj.errors import WeightTrajError
 from weighttraj.format.locate import locate
 
@@ -126,6 +129,86 @@ def _show(
     print(run)
     for array in run.arrays.values():
         print(f"  {array!r}")
+
+
+@app.command(name="list")
+def _list() -> None:
+    """List the data sets that can be named by an id here."""
+    table = Table(title="data sets")
+    for column in ("id", "version", "status", "runs", "MB", "path"):
+        table.add_column(column, justify="right" if column in ("runs", "MB") else "left")
+    for dataset in registry.local_datasets():
+        try:
+            info = dataset.info
+            said = [info.version, info.status, str(len(info.runs))]
+        except WeightTrajError as error:
+            said = ["-", f"damaged: {error.message.splitlines()[0]}", "-"]
+        row = [dataset.id, *said, f"{dataset.size / 1e6:.1f}", str(dataset.path)]
+        table.add_row(*map(escape, row))
+    console.print(table)
+
+
+@app.command(name="search")
+def _search(
+    query: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            help="a condition, such as \"env == 'HalfCheetah-v4' and final_return > 3000\""
+        ),
+    ],
+    columns: Annotated[tuple[str, ...], tyro.conf.arg(help="what is shown of each run")] = (
+        *("dataset", "run_id", "env", "algorithm", "seed", "split"),
+        *("n_snapshots", "n_params", "final_return"),
+    ),
+) -> None:
+    """Find runs of all data sets that are here, by their environment, return, hyper-parameters."""
+    found = registry.search(query)
+    table = Table(title=f"{len(found)} runs")
+    shown = [column for column in columns if column in found.columns]
+    for column in shown:
+        table.add_column(column)
+    for row in found[shown].itertuples(index=False):
+        table.add_row(*(escape(_text(value)) for value in row))
+    console.print(table)
+
+
+def _text(value: object) -> str:
+    return f"{value:.1f}" if isinstance(value, float) else str(value)
+
+
+@app.command(name="combine")
+def _combine(
+    paths: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(help="data sets: paths or ids")
+    ],
+    out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
+) -> None:
+    """Make one data set of the runs of several; these stay."""
+    print(registry.combine(paths, out, console=console))
+
+
+@app.command(name="split")
+def _split(
+    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set: path or id")],
+    out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
+    fractions: Annotated[
+        tuple[float, float, float], tyro.conf.arg(help="of the runs: training, validation, test")
+    ] = (0.6, 0.2, 0.2),
+    seed: Annotated[int, tyro.conf.arg(help="of the draw")] = 0,
+) -> None:
+    """Divide the runs of a data set anew, in a new data set."""
+    print(registry.split(path, out, fractions=fractions, seed=seed, console=console))
+
+
+@app.command(name="delete")
+def _delete(
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="id, as `list` shows it")],
+    yes: Annotated[bool, tyro.conf.arg(help="do not ask")] = False,
+) -> None:
+    """Remove a data set from this machine. There is no way back."""
+    if not yes and not Confirm.ask(f"remove {name} and all its runs from this machine?"):
+        raise SystemExit(1)
+    print(f"removed {registry.delete(name)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -92,6 +92,10 @@ class LoaderError(WeightTrajError, ValueError):
     """A loader's saved state does not fit the loader it is given to."""
 
 
+class RegistryError(WeightTrajError, ValueError):
+    """Data sets that cannot be found, combined, split, searched or deleted as asked."""
+
+
 class MissingExtraError(WeightTrajError, ImportError):
     """An optional dependency is not installed."""
 

@@ -48,7 +48,16 @@ def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
             where=path,
             do="choose one of the seeds",
         )
-    recipe = msgspec.convert(dataset.info.recipe, Recipe)
+    try:
+        recipe = msgspec.convert(dataset.info.recipe, Recipe)
+    except msgspec.ValidationError as error:
+        raise CollectError(
+            "the data set was not collected from a recipe",
+            expected="a recipe in dataset.json",
+            got=dataset.info.recipe,
+            where=path,
+            do="verify the data sets that it was made of",
+        ) from error
     return _compare(runs[0], recipe, min(n, len(runs[0])))
 
 

@@ -8,14 +8,17 @@ from pathlib import Path
 
 VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
 """Environment variable: folders that hold data sets, as in PATH."""
+HOME = "~/.weighttraj/datasets"
+"""Where data sets are kept if the variable names no folder."""
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_ID = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,127}/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 def locate(path: str | Path) -> Path:
     """The path of a data set: the path itself, or where the data set of an id lies.
 
-    An id is looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH``, then in ``datasets`` of the
+    An id, with a namespace or without, is looked for in the folders of
+    ``WEIGHTTRAJ_DATASETS_PATH``, or else in ``~/.weighttraj/datasets``, then in ``datasets`` of the
     clone that this package was installed from. There, ``<id>`` or ``<id>/data`` is the data set.
 
     Raises:
@@ -37,9 +40,15 @@ def locate(path: str | Path) -> Path:
 
 def folders() -> list[Path]:
     """Folders in which data sets are looked for, the first one first."""
-    named = os.environ.get(VARIABLE, "").split(os.pathsep)
-    clone = Path(__file__).parents[2] / "datasets"
-    return [Path(name).expanduser() for name in named if name] + [clone] * clone.is_dir()
+    named = [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+    own = clone()
+    return [Path(name).expanduser() for name in named or [HOME]] + ([own] if own else [])
 
 
-__all__ = ["VARIABLE", "folders", "locate"]
+def clone() -> Path | None:
+    """``datasets`` of the clone that this package was installed from; None: from no clone."""
+    place = Path(__file__).parents[2] / "datasets"
+    return place if place.is_dir() else None
+
+
+__all__ = ["HOME", "VARIABLE", "clone", "folders", "locate"]

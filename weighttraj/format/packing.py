@@ -13,7 +13,7 @@ from weighttraj.errors import FormatError
 from weighttraj.format.live import LiveStore
 from weighttraj.format.objects import ZipObjects, sync, write_zip
 from weighttraj.format.schema import AXES, Profile
-from weighttraj.format.storage import PACKED, RunStore
+from weighttraj.format.storage import PACKED, RunStore, group_document
 
 
 def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | None = None) -> Path:
@@ -70,6 +70,29 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
     return target
 
 
+def copy_packed(path: Path, out: Path, run_id: str) -> None:
+    """Copy a packed run under another id: all but its metadata byte for byte.
+
+    Args:
+        path: the packed run.
+        out: file to be written; may be the same. It is replaced.
+        run_id: of the copy.
+    """
+    store, source = RunStore.open(path), ZipObjects(path)
+    info = replace(store.info, run_id=run_id)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
+        metadata = Path(folder) / "zarr.json"
+        metadata.write_bytes(group_document(info, store.documents, store.tags, store.attributes))
+        draft = Path(folder) / "run.zip"
+        write_zip(
+            draft,
+            ((name, metadata if name == "zarr.json" else source) for name in source.names),
+        )
+        sync(draft)
+        draft.replace(out)
+    sync(out.parent)
+
+
 def same_as_packed(path: Path) -> bool:
     """Whether a packed run is, to the last byte, what packing its own members gives.
 
@@ -115,4 +138,4 @@ def _equal(one: Path, other: Path) -> bool:
     return True
 
 
-__all__ = ["pack", "packed_order", "same_as_packed", "unpacked"]
+__all__ = ["copy_packed", "pack", "packed_order", "same_as_packed", "unpacked"]

@@ -1,0 +1,258 @@
+"""Data sets by id on this machine: found, searched, combined, split, deleted."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import weighttraj as wt
+from tests.small import SMALL_RECIPE
+from tests.test_cli import run as shell
+from weighttraj.collect import collect, replay
+from weighttraj.collect.recipe import Seeds
+from weighttraj.errors import CollectError, FormatError, RegistryError, StoreExistsError
+from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.format.locate import VARIABLE, clone, locate
+from weighttraj.registry import combine, delete, local_datasets, search, split
+from weighttraj.registry.derive import SPLITS, _parts
+
+
+@pytest.fixture
+def store(small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of data sets: one of its own name, one below ``data``, one with a namespace."""
+    folder = tmp_path / "store"
+    shutil.copytree(small_dataset, folder / "small")
+    shutil.copytree(small_dataset, folder / "below" / "data")
+    shutil.copytree(small_dataset, folder / "team" / "theirs")
+    (folder / "notes").mkdir()
+    monkeypatch.setenv(VARIABLE, str(folder))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of the same seeds as the small ones, and of another environment."""
+    path = tmp_path_factory.mktemp("other") / "other"
+    ppo = replace(SMALL_RECIPE.ppo, env_id="CartPole-v1", total_timesteps=128)
+    recipe = replace(SMALL_RECIPE, id="other", ppo=ppo, seeds=Seeds(train=[0], test=[1]))
+    collect(recipe, path)
+    return path
+
+
+# What is here
+
+
+def test_data_sets_are_found_as_they_are_named(store: Path) -> None:
+    found = {dataset.id: dataset for dataset in local_datasets()}
+    assert {"small", "below", "team/theirs", "inverted-pendulum-v4-ppo-v1"} <= found.keys()
+    assert "notes" not in found
+    for name, dataset in found.items():
+        assert locate(name) == dataset.path
+    assert found["small"].size == sum(
+        file.stat().st_size for file in (store / "small").rglob("*") if file.is_file()
+    )
+    assert [run.id for run in found["below"].info.runs] == [
+        run.id for run in wt.open("team/theirs")
+    ]
+
+
+def test_the_first_folder_wins(
+    store: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(other, tmp_path / "first" / "small")
+    monkeypatch.setenv(VARIABLE, f"{tmp_path / 'first'}:{store}")
+    (found,) = (dataset for dataset in local_datasets() if dataset.id == "small")
+    assert found.info.id == "other"
+    assert wt.open("small").info.id == "other"
+
+
+def test_without_the_variable_home_is_looked_in(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    shutil.copytree(store / "small", tmp_path / "home/.weighttraj/datasets/mine")
+    assert wt.open("mine").info.id == "small"
+    with pytest.raises(FileNotFoundError, match="none of that id in"):
+        wt.open("team/nobody")
+
+
+def test_a_damaged_data_set_does_not_hide_the_others(store: Path) -> None:
+    file = store / "small/dataset.json"
+    file.write_text(file.read_text().replace("seed0001", "seed0009"))
+    done = shell("weighttraj", "list")
+    assert done.returncode == 0
+    assert "damaged" in done.stdout
+    assert "team/theirs" in done.stdout
+
+
+# Search
+
+
+def test_a_search_finds_runs_by_what_they_are(store: Path, other: Path) -> None:
+    shutil.copytree(other, store / "other")
+    everything = search()
+    assert Counter(everything["dataset"])["other"] == 2
+    assert len(search("env == 'CartPole-v1'")) == 2
+    found = search("dataset == 'small' and seed >= 1 and `hyperparameters.batch_size` == 16")
+    assert found["run_id"].tolist() == ["seed0001", "seed0002", "seed0003"]
+    assert search("final_return > 1e9").empty
+    returns = [run.final_return for run in wt.open("small")]
+    lowest = search(f"dataset == 'small' and final_return <= {min(returns)}")
+    assert lowest["final_return"].tolist() == [min(returns)]
+
+
+def test_data_sets_without_a_table_are_searched_too(store: Path) -> None:
+    shutil.rmtree(store / "small/tables")
+    kept = search("dataset == 'below'").drop(columns="dataset")
+    built = search("dataset == 'small'").drop(columns="dataset")
+    for column in kept.columns:
+        assert kept[column].tolist() == built[column].tolist() or kept[column].isna().all()
+
+
+@pytest.mark.parametrize("query", ["env ==", "colour == 'red'", "import os", "seed + 1"])
+def test_queries_that_mean_nothing_are_refused(query: str, store: Path) -> None:
+    with pytest.raises(RegistryError, match=r"cannot be understood(.|\n)*final_return"):
+        search(query)
+
+
+# New ones of old ones
+
+
+def test_combined_runs_keep_their_bytes_and_splits(
+    store: Path, other: Path, tmp_path: Path
+) -> None:
+    both = combine([store / "small", other], tmp_path / "both")
+    assert wt.verify(both.path, deep=True) == []
+    assert [run.id for run in both][-2:] == ["other.seed0000", "other.seed0001"]
+    assert both.info.id == "both"
+    assert both.info.recipe == {
+        "combined": [{"id": "small", "version": "1"}, {"id": "other", "version": "1"}]
+    }
+    old = [*wt.open(store / "small"), *wt.open(other)]
+    for ours, theirs in zip(both, old, strict=True):
+        assert (ours.split, ours.info.seed) == (theirs.split, theirs.info.seed)
+        assert ours.info.run_id == ours.id
+        assert replace(ours.info, run_id=theirs.id) == theirs.info
+        for name in theirs.arrays:
+            assert np.array_equal(ours[name][:], theirs[name][:], equal_nan=True)
+    with pytest.raises(CollectError, match="not collected from a recipe"):
+        replay(both.path, 3)
+
+
+def test_runs_of_other_ids_keep_them(store: Path, tmp_path: Path) -> None:
+    seeds = Seeds(train=[7])
+    collect(replace(SMALL_RECIPE, id="more", seeds=seeds), tmp_path / "more")
+    both = combine(["small", tmp_path / "more"], tmp_path / "both", name="both-v1")
+    assert both.info.id == "both-v1"
+    assert [run.id for run in both] == [f"seed000{n}" for n in (0, 1, 2, 3, 7)]
+    packed = [store / "small/runs/seed0000.zarr.zip", both.path / "runs/seed0000.zarr.zip"]
+    assert packed[0].read_bytes() == packed[1].read_bytes()
+
+
+def test_what_cannot_be_one_is_refused(store: Path, tmp_path: Path) -> None:
+    for paths in (["small"], ["small", "below"]):
+        with pytest.raises(RegistryError, match="of different ids"):
+            combine(paths, tmp_path / "out")
+    info = read_dataset_info(store / "team/theirs")
+    write_dataset_info(store / "team/theirs", replace(info, id="theirs", licence="CC-BY-NC-4.0"))
+    with pytest.raises(RegistryError, match=r"same licence(.|\n)*NC"):
+        combine(["small", "team/theirs"], tmp_path / "out")
+    write_dataset_info(store / "team/theirs", replace(info, id="theirs", status="collecting"))
+    with pytest.raises(RegistryError, match="only a complete data set"):
+        combine(["small", "team/theirs"], tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    with pytest.raises(StoreExistsError):
+        split("small", tmp_path / "out")
+
+
+def test_a_split_is_by_run_and_by_seed(store: Path, tmp_path: Path) -> None:
+    one = split("small", tmp_path / "one", fractions=(0.5, 0.25, 0.25), seed=1)
+    assert wt.verify(one.path, deep=True) == []
+    assert Counter(run.split for run in one) == {"train": 2, "validation": 1, "test": 1}
+    again = split("small", tmp_path / "again", fractions=(0.5, 0.25, 0.25), seed=1, name="one")
+    assert {p.name: p.read_bytes() for p in (again.path / "runs").iterdir()} == {
+        p.name: p.read_bytes() for p in (one.path / "runs").iterdir()
+    }
+    assert [run.split for run in again] == [run.split for run in one]
+    splits = {
+        tuple(_parts(4, (0.5, 0.25, 0.25))[i] for i in np.random.default_rng(seed).permutation(4))
+        for seed in range(9)
+    }
+    assert len(splits) > 3
+
+
+@pytest.mark.parametrize(
+    ("count", "fractions", "sizes"),
+    [
+        (50, (0.6, 0.2, 0.2), (30, 10, 10)),
+        (10, (0.6, 0.2, 0.2), (6, 2, 2)),
+        (3, (0.98, 0.01, 0.01), (1, 1, 1)),
+        (7, (0.5, 0.5, 0.0), (4, 3, 0)),
+        (8, (0.6, 0.2, 0.2), (5, 2, 1)),
+        (5, (1.0, 0.0, 0.0), (5, 0, 0)),
+    ],
+)
+def test_parts_are_as_large_as_their_fractions(
+    count: int, fractions: tuple[float, float, float], sizes: tuple[int, int, int]
+) -> None:
+    got = Counter(_parts(count, fractions))
+    assert tuple(got[name] for name in SPLITS) == sizes
+
+
+@pytest.mark.parametrize("fractions", [(0.5, 0.2, 0.2), (1.2, -0.2, 0.0)])
+def test_fractions_that_are_none_are_refused(
+    fractions: tuple[float, float, float], store: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(RegistryError, match="sum to 1"):
+        split("small", tmp_path / "out", fractions=fractions)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_leaves_nothing_behind(store: Path, disk: Path) -> None:
+    with pytest.raises(FormatError, match=r"could not be written(.|\n)*make room"):
+        split("small", disk / "out")
+    assert list(disk.iterdir()) == []
+
+
+# Delete
+
+
+def test_a_deleted_data_set_is_gone(store: Path) -> None:
+    assert delete("below") == store / "below"
+    assert not list(store.glob("*below*"))
+    assert delete("team/theirs") == store / "team/theirs"
+    assert {"small", "notes", "team"} == {path.name for path in store.iterdir()}
+
+
+def test_what_must_stay_is_not_deleted(store: Path) -> None:
+    with pytest.raises(RegistryError, match="of a clone"):
+        delete("inverted-pendulum-v4-ppo-v1")
+    with pytest.raises(FileNotFoundError, match="none of that id"):
+        delete("nobody")
+    with pytest.raises(RegistryError, match="only what has an id"):
+        delete(str(store / "small"))
+    own = clone()
+    assert own is not None
+    assert (own / "inverted-pendulum-v4-ppo-v1").is_dir()
+    assert (store / "small").is_dir()
+
+
+def test_the_commands(store: Path, tmp_path: Path) -> None:
+    listed = shell("weighttraj", "list").stdout
+    assert all(name in listed for name in ("small", "below", "team/theirs"))
+    found = shell("weighttraj", "search", "seed == 2", "--columns", "dataset", "run_id").stdout
+    assert found.count("seed0002") >= 3
+    refused = shell("weighttraj", "search", "colour == 1")
+    assert refused.returncode == 1
+    assert "Traceback" not in refused.stderr + refused.stdout
+    done = shell("weighttraj", "split", "small", "--out", tmp_path / "new", "--seed", 3)
+    assert done.returncode == 0
+    assert len(wt.open(tmp_path / "new")) == 4
+    assert shell("weighttraj", "delete", "small", "--yes").returncode == 0
+    assert not (store / "small").exists()

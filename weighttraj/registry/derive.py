@@ -1,0 +1,188 @@
+"""New data sets made of old ones. The old ones stay, and so do the weights: bytes are copied."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from weighttraj.errors import FormatError, RegistryError
+from weighttraj.format import Dataset, DatasetInfo, Run, RunEntry, open_dataset, pack, seal
+from weighttraj.format.catalog import write_dataset_info
+from weighttraj.format.objects import refuse_existing
+from weighttraj.format.packing import copy_packed
+from weighttraj.format.storage import PACKED
+
+SPLITS = ("train", "validation", "test")
+"""Parts of a data set."""
+
+
+def combine(
+    paths: Sequence[str | Path],
+    out: str | Path,
+    *,
+    name: str | None = None,
+    console: Console | None = None,
+) -> Dataset:
+    """One data set of the runs of several, each in the split that it is in.
+
+    Where two runs have one id, every run gets the id of its data set before its own:
+    ``walker-ppo-v1.seed0000``.
+
+    Args:
+        paths: data sets: paths or ids; complete ones.
+        out: folder of the new one.
+        name: its id; None: the folder's name.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        RegistryError: there are less than two, one is not complete, or two have the same id or
+            different licences.
+        StoreExistsError: the folder exists.
+    """
+    datasets = [_complete(path) for path in paths]
+    ids = Counter(dataset.info.id for dataset in datasets)
+    licences = {dataset.info.licence for dataset in datasets}
+    if len(datasets) < 2 or max(ids.values()) > 1 or len(licences) > 1:
+        raise RegistryError(
+            "these data sets cannot be one",
+            expected="two or more, of different ids and the same licence",
+            got=", ".join(f"{d.info.id} ({d.info.licence})" for d in datasets),
+            do="leave one out; what may not be published together stays apart",
+        )
+    counts = Counter(run.id for dataset in datasets for run in dataset)
+    clash = max(counts.values(), default=0) > 1
+    chosen = {
+        (f"{dataset.info.id}.{run.id}" if clash else run.id): (run, run.split)
+        for dataset in datasets
+        for run in dataset
+    }
+    source = {"combined": [{"id": d.info.id, "version": d.info.version} for d in datasets]}
+    info = DatasetInfo(id=name or Path(out).name, licence=licences.pop(), recipe=source)
+    return _write(Path(out), info, chosen, console)
+
+
+def split(
+    path: str | Path,
+    out: str | Path,
+    *,
+    fractions: tuple[float, float, float] = (0.6, 0.2, 0.2),
+    seed: int = 0,
+    name: str | None = None,
+    console: Console | None = None,
+) -> Dataset:
+    """The same runs, divided anew into training, validation and test, by run.
+
+    Args:
+        path: data set: path or id; a complete one.
+        out: folder of the new one.
+        fractions: of the runs, in this order; of a part above 0 there is one run at least.
+        seed: of the draw.
+        name: its id; None: the folder's name.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        RegistryError: the data set is not complete, the fractions do not sum to 1, or there are
+            fewer runs than parts.
+        StoreExistsError: the folder exists.
+    """
+    dataset = _complete(path)
+    parts = _parts(len(dataset), fractions)
+    order = np.random.default_rng(seed).permutation(len(dataset))
+    of_run = {int(run): part for run, part in zip(order, parts, strict=True)}
+    chosen = {run.id: (run, of_run[number]) for number, run in enumerate(dataset)}
+    source = {
+        "split": {
+            "id": dataset.info.id,
+            "version": dataset.info.version,
+            "fractions": list(fractions),
+            "seed": seed,
+        }
+    }
+    info = DatasetInfo(id=name or Path(out).name, licence=dataset.info.licence, recipe=source)
+    return _write(Path(out), info, chosen, console)
+
+
+def _complete(path: str | Path) -> Dataset:
+    dataset = open_dataset(path)
+    if dataset.info.status != "complete" or dataset.path.is_file():
+        raise RegistryError(
+            "only a complete data set in a folder can be made into another one",
+            expected="status complete",
+            got="an HDF5 file" if dataset.path.is_file() else dataset.info.status,
+            where=dataset.path,
+            do="finish collecting it, or import the file first",
+        )
+    return dataset
+
+
+def _parts(count: int, fractions: Sequence[float]) -> list[str]:
+    """A part for each run, as close to the fractions as whole runs allow."""
+    wanted = np.asarray(fractions, float)
+    if (wanted < 0).any() or abs(wanted.sum() - 1) > 1e-6 or count < (wanted > 0).sum():
+        raise RegistryError(
+            "the runs cannot be divided so",
+            expected=f"fractions that sum to 1, and a run for each part; there are {count} runs",
+            got=tuple(fractions),
+            do="give other --fractions",
+        )
+    sizes = (wanted > 0).astype(int)
+    while sizes.sum() < count:
+        sizes[int((wanted * count - sizes).argmax())] += 1  # what lacks most
+    return [part for part, size in zip(SPLITS, sizes, strict=True) for _ in range(size)]
+
+
+def _write(
+    out: Path,
+    info: DatasetInfo,
+    chosen: Mapping[str, tuple[Run, Any]],
+    console: Console | None,
+) -> Dataset:
+    """Copy the runs beside the place, then rename: half a data set has a hidden name."""
+    refuse_existing(out)
+    console = console or Console(quiet=True)
+    draft = out.with_name(f".{out.name}.{os.getpid()}.draft")
+    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn())
+    try:
+        (draft / "runs").mkdir(parents=True)
+        entries = []
+        with Progress(*columns, console=console, disable=console.quiet) as progress:
+            for new, (run, part) in progress.track(chosen.items()):
+                entry = RunEntry(
+                    id=new, path=f"runs/{new}.zarr{PACKED}", seed=run.info.seed, split=part
+                )
+                _copy(run, draft / entry.path, new)
+                entries.append(entry)
+        write_dataset_info(draft, replace(info, runs=tuple(entries), status="complete"))
+        seal(draft)
+        draft.rename(out)
+    except OSError as error:
+        raise FormatError(
+            "the data set could not be written; nothing was left behind",
+            got=error,
+            where=out,
+            do="make room, or choose another place, and give the command again",
+        ) from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    return open_dataset(out)
+
+
+def _copy(run: Run, target: Path, run_id: str) -> None:
+    """Byte for byte where the id stays; with other metadata where it does not."""
+    packed = run.path if run.path.is_file() else pack(run.path, out=target)
+    if run_id != run.id:
+        copy_packed(packed, target, run_id)
+    elif packed != target:
+        shutil.copyfile(packed, target)
+
+
+__all__ = ["SPLITS", "combine", "split"]

@@ -1,0 +1,115 @@
+"""The data sets that are on this machine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from weighttraj.errors import RegistryError
+from weighttraj.format import DatasetInfo, open_dataset
+from weighttraj.format.catalog import DATASET, read_dataset_info
+from weighttraj.format.locate import clone, folders, locate
+
+
+@dataclass(frozen=True)
+class LocalDataset:
+    """A data set in one of the folders that hold data sets."""
+
+    id: str
+    """What ``weighttraj.open`` takes: the name of its folder, ``namespace/id`` if it has one."""
+    path: Path
+    """Where it lies."""
+
+    @cached_property
+    def info(self) -> DatasetInfo:
+        """Its list of runs.
+
+        Raises:
+            FormatError: it is damaged, or no data set of this format.
+        """
+        return read_dataset_info(self.path)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its files."""
+        return sum(file.stat().st_size for file in self.path.rglob("*") if file.is_file())
+
+
+def local_datasets() -> list[LocalDataset]:
+    """Every data set that can be named by an id here; of two with one id the one that is found.
+
+    See ``weighttraj.format.locate``: the folders of ``WEIGHTTRAJ_DATASETS_PATH``, the one for
+    downloads, and ``datasets`` of a clone.
+    """
+    found: dict[str, LocalDataset] = {}
+    for folder in folders():
+        for name in _names(folder):
+            if name not in found and (path := _data(folder / name)) is not None:
+                found[name] = LocalDataset(name, path)
+    return sorted(found.values(), key=lambda dataset: dataset.id)
+
+
+def delete(name: str) -> Path:
+    """Remove a data set that is named by its id; of a clone's own nothing is removed.
+
+    It gets a hidden name first, so that nobody opens a half of it. There is no way back.
+
+    Returns:
+        Where it lay.
+
+    Raises:
+        FileNotFoundError: there is no such data set.
+        RegistryError: the name is a path, or the data set belongs to the clone.
+    """
+    known = {dataset.id: dataset.path for dataset in local_datasets()}
+    if name not in known:
+        locate(name)  # says where was looked
+        raise RegistryError(
+            "only what has an id here can be deleted",
+            expected=f"one of {sorted(known)}",
+            got=name,
+            do="remove a folder of your own yourself",
+        )
+    path = known[name]
+    if (own := clone()) is not None and path.is_relative_to(own):
+        raise RegistryError(
+            "the data sets of a clone are not deleted",
+            where=path,
+            do="they belong to the repository; delete the clone, if you must",
+        )
+    open_dataset(path)  # a folder that only looks like a data set is left alone
+    top = path.parent if path.name == "data" else path
+    hidden = top.with_name(f".{top.name}.{os.getpid()}.deleted")
+    top.rename(hidden)
+    shutil.rmtree(hidden)
+    return top
+
+
+def _names(folder: Path) -> Iterator[str]:
+    """Folders in a folder, and those in them that are no data sets themselves."""
+    for place in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if place.name.startswith(".") or not place.is_dir():
+            continue
+        if _data(place) is not None:
+            yield place.name
+            continue
+        yield from (
+            f"{place.name}/{inner.name}"
+            for inner in sorted(place.iterdir())
+            if inner.is_dir() and not inner.name.startswith(".")
+        )
+
+
+def _data(place: Path) -> Path | None:
+    """Where in a folder the data set lies, as ``locate`` finds it."""
+    for path in (place, place / "data"):
+        if (path / DATASET).is_file():
+            return path
+    return None
+
+
+__all__ = ["LocalDataset", "delete", "local_datasets"]

@@ -1,0 +1,71 @@
+"""Runs of all data sets, by what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from weighttraj.errors import RegistryError, missing_extra
+from weighttraj.format import open_dataset
+from weighttraj.format.tables import RUNS, run_row
+from weighttraj.registry.local import LocalDataset, local_datasets
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> pd.DataFrame:
+    """Runs that fit a condition, over all data sets that are here.
+
+    >>> search("env == 'HalfCheetah-v4' and final_return > 3000")  # doctest: +SKIP
+
+    Args:
+        query: a condition on the columns, in the language of ``pandas.DataFrame.query``; names
+            with a point stand between backticks: ``hyperparameters.gamma``. Empty: all runs.
+        datasets: where to look; None: in all of ``local_datasets()``.
+
+    Returns:
+        A row for each run: ``dataset``, and the columns of its table of runs.
+
+    Raises:
+        RegistryError: the query cannot be understood, or names what no run has.
+        MissingExtraError: pandas or pyarrow is not installed.
+    """
+    try:
+        import pandas as pd
+        import pyarrow  # noqa: F401  pandas needs it for the tables
+    except ModuleNotFoundError as error:
+        raise missing_extra(str(error.name), "sb3") from error
+    tables = []
+    for dataset in local_datasets() if datasets is None else datasets:
+        file = dataset.path / RUNS
+        # A data set that is still being collected has no table yet.
+        table = (
+            pd.read_parquet(file)
+            if file.is_file()
+            else pd.DataFrame([run_row(run) for run in open_dataset(dataset.path)])
+        )
+        table.insert(0, "dataset", dataset.id)
+        if len(table):
+            tables.append(table.dropna(axis="columns", how="all"))
+    if not tables:
+        return pd.DataFrame()
+    rows = pd.concat(tables, ignore_index=True)
+    if not query:
+        return rows
+    try:
+        fits = rows.eval(query, engine="python")
+        if not pd.api.types.is_bool_dtype(fits):
+            raise TypeError("this is no condition")
+    except Exception as error:  # the parser's, Python's, numpy's: whatever a user can type
+        raise RegistryError(
+            "the query cannot be understood",
+            expected=f"a condition on {', '.join(rows.columns)}",
+            got=f"{query}: {error}",
+            do="quote text, and put names with a point between backticks: "
+            "\"env == 'HalfCheetah-v4' and `hyperparameters.gamma` < 1\"",
+        ) from error
+    return rows[fits].reset_index(drop=True)
+
+
+__all__ = ["search"]
