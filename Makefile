@@ -30,7 +30,7 @@ lint: setup ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: setup ## measure on two real runs (an hour to collect them), keep the numbers, write them into README
+bench: setup ## measure on two real runs (an hour to collect them), keep the numbers, write them into docs/benchmarks.md
 	$(BIN)/weighttraj collect tests/benchmarks/inverted-pendulum.toml --out data/bench/inverted-pendulum
 	$(BIN)/weighttraj collect tests/benchmarks/half-cheetah.toml --out data/bench/half-cheetah
 	$(BIN)/python -W ignore tests/benchmarks/bench_format.py data/bench/*/runs/*.zarr.zip --save

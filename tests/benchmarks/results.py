@@ -1,17 +1,18 @@
-"""Keeps what benchmarks measured in results.json, and renders it into README.md.
+"""Keeps what benchmarks measured in results.json, and renders it into docs/benchmarks.md.
 
-python tests/benchmarks/results.py    # rewrites the table between the marks in README.md
+python tests/benchmarks/results.py    # rewrites what stands between the marks in the page
 """
 
 from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 FILE = Path(__file__).with_name("results.json")
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "docs/benchmarks.md"
 START = "<!-- measured by tests/benchmarks: rewrite with `python tests/benchmarks/results.py` -->"
 END = "<!-- end of what was measured -->"
 
@@ -24,8 +25,28 @@ def save(name: str, result: dict[str, Any]) -> None:
 
 
 def render(results: dict[str, Any]) -> str:
-    """The table, and a line for each other figure."""
-    sizes = results["format"]["runs"]
+    """All sections: tables, and a line for each other figure."""
+    sections = {
+        "Storing and loading": [*_format(results["format"]), *_bullets(_stored(results))],
+        "Collecting and returns": _bullets(_collected(results)),
+        "Does a population learn as SB3 does?": _section(_learning, results.get("learning")),
+        "Temporal SVD and training": _bullets(_trained(results)),
+        "Recipes": _section(_tried, results.get("recipes")),
+    }
+    written = ("\n".join([f"## {title}", "", *lines]) for title, lines in sections.items() if lines)
+    return "\n\n".join(written)
+
+
+def _section(write: Callable[[dict[str, Any]], list[str]], row: dict[str, Any] | None) -> list[str]:
+    return [] if row is None else write(row)
+
+
+def _bullets(lines: Iterable[str]) -> list[str]:
+    return [f"- {line}" for line in lines]
+
+
+def _format(measured: dict[str, Any]) -> list[str]:
+    sizes = measured["runs"]
     lines = [
         "| weights of one run, kept as | "
         + " | ".join(f"{env}: size | read" for env in sizes)
@@ -41,54 +62,62 @@ def render(results: dict[str, Any]) -> str:
                 f"{fastest:,.0f}x" if fastest >= 100 else f"{fastest:.3g}x",
             ]
         lines.append(f"| {way} | " + " | ".join(cells) + " |")
-    opening = results["format"]["opening"]
-    lines += [
+    return [
+        *lines,
         "",
         "Size: of raw float32. Read: how many times faster than `torch.load` of a file a snapshot, "
         "in CPU time, digests checked.",
-        f"A data set of {opening['runs']} runs is {opening['objects']} objects; from its path to "
-        f"the first window takes {opening['first_window_s']:.2f} s.",
+        "",
     ]
+
+
+def _stored(results: dict[str, Any]) -> Iterator[str]:
+    opening = results["format"]["opening"]
+    yield (
+        f"A data set of {opening['runs']} runs is {opening['objects']} objects; from its path to "
+        f"the first window takes {opening['first_window_s']:.2f} s."
+    )
     if "load" in results:
-        lines.append(_load(results["load"]))
-    if "svd" in results:
-        lines.append(_svd(results["svd"]))
+        yield _load(results["load"])
+
+
+def _collected(results: dict[str, Any]) -> Iterator[str]:
     if "callback" in results:
         callback = results["callback"]
-        lines.append(
+        yield (
             "Recording HalfCheetah 256x256 every 64 gradient steps takes "
             f"{100 * (callback['ratio_inside'] - 1):.2g} % of the training's CPU time and "
             f"{callback['extra_peak_mib'] / callback['block_mib']:.1f} blocks of memory."
         )
-    returns = results.get("returns", {}).values()
-    lines += [_returns(row) for row in returns if isinstance(row, dict)]
-    lines += [
-        f"A population of {row['learners']}, {case}: {row['times_faster']:.1f} times the "
-        "environment steps of SB3 in the same CPU time, both recording."
-        for case, row in results.get("population", {}).get("cases", {}).items()
-    ]
+    for row in results.get("returns", {}).values():
+        if isinstance(row, dict):
+            yield _returns(row)
+    for case, row in results.get("population", {}).get("cases", {}).items():
+        yield (
+            f"A population of {row['learners']}, {case}: {row['times_faster']:.1f} times the "
+            "environment steps of SB3 in the same CPU time, both recording."
+        )
     if "processes" in results:
         row = results["processes"]
-        lines.append(
+        yield (
             f"{row['runs']} runs of {row['iterations']} iterations, {row['case']}: two processes "
             f"are done {row['times_faster']} times as fast as one, start-up included (turns on a "
             f"noisy machine: {', '.join(map(str, sorted(row['ratios'])))})."
         )
+
+
+def _trained(results: dict[str, Any]) -> Iterator[str]:
+    if "svd" in results:
+        yield _svd(results["svd"])
     if "tipl_train" in results:
-        lines.append(_training(results["tipl_train"]))
-    if "learning" in results:
-        lines += _learning(results["learning"])
-    if "recipes" in results:
-        lines += _tried(results["recipes"])
-    return "\n".join(lines)
+        yield _training(results["tipl_train"])
 
 
 def _tried(recipes: dict[str, Any]) -> list[str]:
     """The table of recipes that were tried short."""
     cases, episodes = recipes["cases"], recipes["episodes"]
     lines = [
-        "",
-        "| [recipe](datasets/README.md), tried short | parameters | seeds | steps a CPU second "
+        "| [recipe](../datasets/README.md), tried short | parameters | seeds | steps a CPU second "
         f"| MB a run | return: first {episodes} episodes | last {episodes} "
         "| whole: CPU hours | GB |",
         "|---|" + "---:|" * 8,
@@ -176,9 +205,7 @@ def _learning(learning: dict[str, Any]) -> list[str]:
     )
     overlaps = sum(row["intervals_overlap"] for row in learning["samples"].values())
     return [
-        "",
-        "Does a population learn as SB3 does? Training returns, means of "
-        f"{learning['episodes']} episodes at the end of each rollout:",
+        f"Training returns, means of {learning['episodes']} episodes at the end of each rollout:",
         "",
         *samples,
         "",
@@ -188,6 +215,7 @@ def _learning(learning: dict[str, Any]) -> list[str]:
         "are of means, with the half width of their 95 % interval: smaller ones seldom show. "
         "p by permutation, of the means and of Kolmogorov-Smirnov's statistic. Control: the "
         "population on SB3's seeds against its own seeds, so that only the seeds differ.",
+        "",
         "The same seeds run by run, p by flipping signs:",
         "",
         *pairs,
@@ -225,4 +253,4 @@ def insert(page: str) -> str:
 
 
 if __name__ == "__main__":
-    README.write_text(insert(README.read_text()))
+    PAGE.write_text(insert(PAGE.read_text()))
