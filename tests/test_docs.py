@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import weighttraj as wt
+
+GUIDES = ["bring-your-own"]
+DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
 
 
@@ -18,3 +24,24 @@ def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPa
     assert study.insert(page) == page, f"the page is stale: run python docs/studies/{name}.py"
     stale = page.replace("snapshot's own normaliser,", "final normaliser,")
     assert study.insert(stale) == page != stale
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_every_block_of_a_guide_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / f"{name}.md").read_text(), re.DOTALL)
+    for block in blocks:
+        exec(compile(block, f"{name}.md", "exec"), names)  # noqa: S102
+    for path in tmp_path.glob("data/mine/*.zarr"):
+        assert wt.verify(path) == []
+    made = wt.open("data/mine/all")
+    assert {run.id: (run.split, len(run)) for run in made} == {
+        "cartpole": ("train", 33),
+        "pendulum": ("", 18),
+        "checkpoints": ("test", 4),
+    }
+    before, after = names["returns"].returns.mean(1)
+    assert after > before

@@ -18,7 +18,7 @@ from weighttraj.collect.recipe import Seeds
 from weighttraj.errors import CollectError, FormatError, RegistryError, StoreExistsError
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.format.locate import VARIABLE, clone, locate
-from weighttraj.registry import combine, delete, local_datasets, search, split
+from weighttraj.registry import combine, create, delete, local_datasets, search, split
 from weighttraj.registry.derive import SPLITS, _parts
 
 
@@ -169,6 +169,22 @@ def test_what_cannot_be_one_is_refused(store: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     with pytest.raises(StoreExistsError):
         split("small", tmp_path / "out")
+
+
+def test_runs_become_a_data_set(store: Path, other: Path, tmp_path: Path) -> None:
+    runs = [store / "small/runs/seed0002.zarr.zip", other / "runs/seed0001.zarr.zip"]
+    made = create(runs, tmp_path / "made", splits={"seed0001": "test"}, licence="MIT")
+    assert wt.verify(made.path, deep=True) == []
+    assert [(run.id, run.split) for run in made] == [("seed0002", ""), ("seed0001", "test")]
+    assert (made.info.licence, made.info.status) == ("MIT", "complete")
+    for clash in ([runs[0], store / "below/data/runs/seed0002.zarr.zip"], []):
+        with pytest.raises(RegistryError, match="each of its own id"):
+            create(clash, tmp_path / "out")
+    for splits in ({"seed0007": "test"}, {"seed0001": "exam"}):
+        with pytest.raises(RegistryError, match="not those of these runs"):
+            create(runs, tmp_path / "out", splits=splits)
+    with pytest.raises(FileNotFoundError):
+        create([tmp_path / "nothing.zarr"], tmp_path / "out")
 
 
 def test_a_split_is_by_run_and_by_seed(store: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "sb3") from error
 
 from weighttraj.collect.callback import WeightTrajectoryCallback
+from weighttraj.collect.modules import describe_mlp
 from weighttraj.collect.ppo import PPOConfig, make_ppo
 from weighttraj.collect.recipe import Recipe, read_recipe
 from weighttraj.collect.replay import replay
@@ -18,6 +19,7 @@ __all__ = [
     "Recipe",
     "WeightTrajectoryCallback",
     "collect",
+    "describe_mlp",
     "make_ppo",
     "read_recipe",
     "replay",

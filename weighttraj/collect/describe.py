@@ -64,7 +64,13 @@ HYPERPARAMETERS = (
 )
 """Attributes of a model that are hyper-parameters with plain values."""
 
-_ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.ELU: "elu", nn.LeakyReLU: "leaky_relu"}
+ACTIVATIONS: dict[type[nn.Module], str] = {
+    nn.Tanh: "tanh",
+    nn.ReLU: "relu",
+    nn.ELU: "elu",
+    nn.LeakyReLU: "leaky_relu",
+}
+"""Modules between layers, and what they are called in the metadata."""
 _CRITIC = ("value_net.", "mlp_extractor.value_net.", "vf_features_extractor.")
 
 
@@ -173,20 +179,10 @@ def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]
     """What it takes to rebuild the policy, or the reasons why it cannot be."""
     space = policy.observation_space
     layers, activation, reasons = _mlp(policy)
-    head: dict[str, Any] = {"head": "other"}
-    if isinstance(policy.action_space, spaces.Box) and not policy.use_sde:
-        head = {
-            "head": "gaussian",
-            "action_shape": policy.action_space.shape,
-            "action_low": tuple(policy.action_space.low.reshape(-1).tolist()),
-            "action_high": tuple(policy.action_space.high.reshape(-1).tolist()),
-        }
-    elif isinstance(policy.action_space, spaces.Discrete):
-        head = {"head": "categorical"}
-        if policy.action_space.start != 0:
-            reasons.append("discrete actions that do not start at 0, which SB3 does not support")
-    else:
-        reasons.append(f"actions in {policy.action_space}, or state-dependent exploration")
+    head, odd = describe_head(policy.action_space)
+    if policy.use_sde:
+        head, odd = {"head": "other"}, ["state-dependent exploration"]
+    reasons += odd
     if policy.squash_output:
         reasons.append("actions squashed by tanh")
     if not isinstance(space, spaces.Box):
@@ -202,6 +198,23 @@ def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]
         cannot_rebuild=tuple(reasons),
         **head,
     )
+
+
+def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
+    """Fields of ``PolicySpec`` on actions, and reasons why they cannot be drawn."""
+    if isinstance(space, spaces.Box):
+        head = {
+            "head": "gaussian",
+            "action_shape": space.shape,
+            "action_low": tuple(space.low.reshape(-1).tolist()),
+            "action_high": tuple(space.high.reshape(-1).tolist()),
+        }
+        return head, []
+    if isinstance(space, spaces.Discrete):
+        starts = int(space.start)
+        odd = "discrete actions that do not start at 0, which SB3 does not support"
+        return {"head": "categorical"}, [odd] * (starts != 0)
+    return {"head": "other"}, [f"actions in {space}"]
 
 
 def describe_env(model: OnPolicyAlgorithm, wrappers: tuple[str, ...]) -> EnvInfo | None:
@@ -284,12 +297,12 @@ def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, l
         return (), "", [*reasons, f"policy class {type(policy).__name__} with no policy_net"]
     linear = [i for i, module in enumerate(net) if isinstance(module, nn.Linear)]
     kinds = {type(m) for m in net if not isinstance(m, nn.Linear)}
-    known = kinds & _ACTIVATIONS.keys()
+    known = kinds & ACTIVATIONS.keys()
     changed = [m for m in net if type(m) in known and repr(m) != repr(type(m)())]
     if kinds != known or len(kinds) > 1 or len(net) != 2 * len(linear) or changed:
         names = sorted(kind.__name__ for kind in kinds)
         reasons.append(f"hidden modules {names}, not one activation after each linear layer")
-    activation = next((_ACTIVATIONS[kind] for kind in known), "")
+    activation = next((ACTIVATIONS[kind] for kind in known), "")
     prefixes = [f"mlp_extractor.policy_net.{i}" for i in linear] + ["action_net"]
     return tuple((f"{p}.weight", f"{p}.bias") for p in prefixes), activation, reasons
 

@@ -113,7 +113,7 @@ class Policy:
         inputs = self.normalize(observation if batched else observation[None])
         distribution = self.distribution(torch.from_numpy(inputs))
         actions = self._choose(distribution, deterministic)
-        return (actions if batched else actions[0]), state
+        return (actions if batched else actions.squeeze(0)), state
 
     def _choose(self, distribution: Normal | Categorical, deterministic: bool) -> np.ndarray:
         if isinstance(distribution, Categorical):

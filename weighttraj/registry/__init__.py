@@ -1,11 +1,11 @@
-"""Data sets by their ids: which are here, what they hold, and new ones made of old ones.
+"""Data sets by their ids: which are here, what they hold, and new ones.
 
-``local`` finds and deletes, ``search`` asks all runs of all data sets, ``derive`` combines data
-sets and splits one anew.
+``local`` finds and deletes, ``search`` asks all runs of all data sets, ``derive`` makes a data set
+of runs, or of others.
 """
 
-from weighttraj.registry.derive import combine, split
+from weighttraj.registry.derive import combine, create, split
 from weighttraj.registry.local import LocalDataset, delete, local_datasets
 from weighttraj.registry.search import search
 
-__all__ = ["LocalDataset", "combine", "delete", "local_datasets", "search", "split"]
+__all__ = ["LocalDataset", "combine", "create", "delete", "local_datasets", "search", "split"]

@@ -1,4 +1,4 @@
-"""New data sets made of old ones. The old ones stay, and so do the weights: bytes are copied."""
+"""New data sets, of runs or of other data sets. These stay; the weights' bytes are copied."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from weighttraj.errors import FormatError, RegistryError
-from weighttraj.format import Dataset, DatasetInfo, Run, RunEntry, open_dataset, pack, seal
+from weighttraj.format import (
+    Dataset,
+    DatasetInfo,
+    Run,
+    RunEntry,
+    open_dataset,
+    open_run,
+    pack,
+    seal,
+)
 from weighttraj.format.catalog import write_dataset_info
 from weighttraj.format.objects import refuse_existing
 from weighttraj.format.packing import copy_packed
@@ -23,6 +32,52 @@ from weighttraj.format.storage import PACKED
 
 SPLITS = ("train", "validation", "test")
 """Parts of a data set."""
+
+
+def create(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    splits: Mapping[str, str] | None = None,
+    name: str | None = None,
+    licence: str = "CC-BY-4.0",
+    console: Console | None = None,
+) -> Dataset:
+    """A data set of finished runs, wherever they come from.
+
+    Args:
+        runs: paths of runs, folders or packed ones, each of its own id.
+        out: folder of the new data set.
+        splits: ``train``, ``validation`` or ``test`` for ids of runs; others are in no part.
+        name: its id; None: the folder's name.
+        licence: of the data, as an SPDX identifier.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        FileNotFoundError: there is no run at a path.
+        RegistryError: a run is not complete, two have one id, or a split is of no run or none.
+        StoreExistsError: the folder exists.
+    """
+    opened, wanted = [open_run(path) for path in runs], dict(splits or {})
+    ids = Counter(run.id for run in opened)
+    unfinished = [run.id for run in opened if run.info.status != "complete"]
+    if not opened or max(ids.values()) > 1 or unfinished:
+        raise RegistryError(
+            "these runs make no data set",
+            expected="complete runs, each of its own id",
+            got=f"{', '.join(run.id for run in opened) or 'none'}; not complete: {unfinished}",
+            do="finish them, and give each a run_id of its own",
+        )
+    if wanted.keys() - ids.keys() or set(wanted.values()) - {*SPLITS}:
+        raise RegistryError(
+            "the parts are not those of these runs",
+            expected=f"{', '.join(SPLITS)} for some of {', '.join(ids)}",
+            got=wanted,
+            do="correct splits",
+        )
+    chosen = {run.id: (run, wanted.get(run.id, "")) for run in opened}
+    info = DatasetInfo(id=name or Path(out).name, licence=licence)
+    return _write(Path(out), info, chosen, console)
 
 
 def combine(
@@ -185,4 +240,4 @@ def _copy(run: Run, target: Path, run_id: str) -> None:
         shutil.copyfile(packed, target)
 
 
-__all__ = ["SPLITS", "combine", "split"]
+__all__ = ["SPLITS", "combine", "create", "split"]

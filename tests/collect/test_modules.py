@@ -1,0 +1,73 @@
+"""Networks of other trainings, described."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from torch import nn
+
+from weighttraj.collect import describe_mlp
+from weighttraj.collect.describe import actor_parameters, describe_layout, describe_policy
+from weighttraj.errors import CollectError
+from weighttraj.policies.policy import Policy
+
+BOX = spaces.Box(-1, 1, (3,))
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1"])
+def test_it_says_of_a_network_what_the_collector_says_of_the_model(env_id: str) -> None:
+    env = gym.make(env_id)
+    model = PPO("MlpPolicy", env, seed=0, device="cpu")
+    actor = nn.Sequential(*model.policy.mlp_extractor.policy_net, model.policy.action_net)
+    layout, spec = describe_mlp(actor, env.observation_space, env.action_space)
+    wanted = describe_policy(model.policy, ())
+    assert {**vars(spec), "layers": ()} == {**vars(wanted), "layers": ()}
+    theirs = describe_layout(actor_parameters(model.policy), wanted)
+    assert {(p.shape, p.role, p.axes) for p in layout.params} == {
+        (p.shape, p.role, p.axes) for p in theirs.params
+    }
+    tensors = actor.state_dict()
+    if env_id == "Pendulum-v1":
+        tensors |= {"log_std": model.policy.log_std.detach()}
+    policy = Policy(spec, layout, layout.flatten(tensors))
+    obs = np.linspace(-1, 1, env.observation_space.shape[0], dtype=np.float32)  # type: ignore[index]
+    ours, _ = policy.predict(obs, deterministic=True)
+    assert np.array_equal(ours, model.predict(obs, deterministic=True)[0])
+
+
+@pytest.mark.parametrize(
+    ("actor", "observations", "actions", "said"),
+    [
+        (nn.Sequential(nn.Linear(3, 2), nn.Tanh()), BOX, BOX, "layers that are not"),
+        (nn.Sequential(nn.Linear(3, 2), nn.Linear(2, 3)), BOX, BOX, "layers that are not"),
+        (nn.Sequential(nn.Linear(3, 3, bias=False)), BOX, BOX, "with biases"),
+        (
+            nn.Sequential(nn.Linear(3, 2), nn.Tanh(), nn.Linear(2, 2), nn.ReLU(), nn.Linear(2, 3)),
+            BOX,
+            BOX,
+            "layers that are not",
+        ),
+        (
+            nn.Sequential(nn.Linear(3, 2), nn.LeakyReLU(0.3), nn.Linear(2, 3)),
+            BOX,
+            BOX,
+            "layers that are not",
+        ),
+        (nn.Sequential(nn.Linear(3, 2)), BOX, spaces.Discrete(2, start=1), "start at 0"),
+        (nn.Sequential(nn.Linear(3, 2)), BOX, spaces.MultiBinary(2), "actions in MultiBinary"),
+        (nn.Sequential(nn.Linear(3, 2)), spaces.Discrete(3), BOX, "observations in a Discrete"),
+    ],
+)
+def test_what_is_no_perceptron_is_refused(
+    actor: nn.Sequential, observations: spaces.Space, actions: spaces.Space, said: str
+) -> None:
+    with pytest.raises(CollectError, match=said):
+        describe_mlp(actor, observations, actions)
+
+
+def test_one_layer_is_a_perceptron() -> None:
+    layout, spec = describe_mlp(nn.Sequential(nn.Linear(3, 2)), BOX, spaces.Discrete(2))
+    assert (layout.size, spec.activation, spec.layers) == (8, "", (("0.weight", "0.bias"),))
