@@ -340,6 +340,8 @@ def test_the_page_stands_alone_and_says_who_wins(
         ((-1, -2), "loses to copying"),
         ((0.1, -1), "splits with copying"),
         ((0.0, 0.0), "does not clearly differ from copying"),
+        ((-1, 0.0), "loses to copying"),
+        ((0.2, 0.0), "beats copying"),
     ],
 )
 def test_the_verdict_is_plain(skills: tuple[float, float], said: str) -> None:

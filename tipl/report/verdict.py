@@ -57,13 +57,15 @@ def _sentences(results: dict[str, Any], name: str) -> Iterator[str]:
 def _weights(results: dict[str, Any], name: str) -> str:
     """Skill by horizon, and what it says of the model."""
     skills = rows_of(results["forecasters"][name], SKILL)
-    signs = {_sign(row) for row in skills}
-    if signs == {1}:
-        relation = "beats"
-    elif signs == {-1}:
-        relation = "loses to"
-    elif {1, -1} <= signs:
+    better, worse, unclear = (
+        ", ".join(str(row["h"]) for row in skills if _sign(row) == sign) for sign in (1, -1, 0)
+    )
+    if better and worse:
         relation = "splits with"
+    elif better:
+        relation = "beats"
+    elif worse:
+        relation = "loses to"
     else:
         relation = "does not clearly differ from"
     shown = [row for row in skills if row["h"] in (1, NEAR, skills[-1]["h"])]
@@ -71,11 +73,10 @@ def _weights(results: dict[str, Any], name: str) -> str:
         f"In weight error, {label(name)} {relation} copying the last weights{_where(results)}: its "
         f"skill (0 is the copy, 1 the truth) is {_listed(shown)}."
     )
-    if relation == "splits with":
-        better, worse = (
-            ", ".join(str(row["h"]) for row in skills if _sign(row) == sign) for sign in (1, -1)
-        )
+    if better and worse:
         text += f" It is better at h = {better}, worse at h = {worse}."
+    elif unclear and (better or worse):
+        text += f" It does not clearly differ at h = {unclear}."
     return text
 
 
