@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 # Each module, and what of ours it may import. A package stands for all in it, `door` for what the
 # package itself names. `later`: inside a function, which opens another room when it is called.
 FORMAT = "weighttraj.format"
+REMOTE = "weighttraj.remote.address"
 ALLOWED = {
     "weighttraj.errors": [],
     "weighttraj.threads": [],
@@ -23,9 +24,19 @@ ALLOWED = {
         "weighttraj.engine",
         "later weighttraj.engine.cluster",
     ],
+    "weighttraj.remote": [
+        "weighttraj.errors",
+        "weighttraj.remote",
+        "later weighttraj.remote.hub",
+    ],
     "weighttraj.format.layout": ["weighttraj.errors"],
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
-    "weighttraj.format.objects": ["weighttraj.errors"],
+    "weighttraj.format.objects": ["weighttraj.errors", "weighttraj.remote.address"],
+    "weighttraj.format.remote": [
+        "weighttraj.errors",
+        "weighttraj.format.objects",
+        "weighttraj.remote",
+    ],
     "weighttraj.format.codecs": ["weighttraj.errors", "weighttraj.format.schema"],
     "weighttraj.format.decode": [
         "weighttraj.errors",
@@ -43,6 +54,8 @@ ALLOWED = {
         "weighttraj.format.decode",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
+        REMOTE,
+        "later weighttraj.format.remote",
     ],
     "weighttraj.format.live": [
         "weighttraj.errors",
@@ -51,9 +64,11 @@ ALLOWED = {
         "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
+        REMOTE,
     ],
     "weighttraj.format.packing": [
         "weighttraj.errors",
+        REMOTE,
         "weighttraj.format.live",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
@@ -73,6 +88,7 @@ ALLOWED = {
         "weighttraj.format.schema",
         "weighttraj.format.storage",
         "weighttraj.format.writer",
+        REMOTE,
     ],
     "weighttraj.format.catalog": [
         "weighttraj.errors",
@@ -85,8 +101,8 @@ ALLOWED = {
         "weighttraj.format.objects",
         "weighttraj.format.reader",
     ],
-    "weighttraj.format.lint": ["weighttraj.format.reader"],
-    "weighttraj.format.locate": [],
+    "weighttraj.format.lint": ["weighttraj.format.reader", REMOTE],
+    "weighttraj.format.locate": ["weighttraj.remote"],
     "weighttraj.format.reader": [
         "weighttraj.errors",
         "weighttraj.format.catalog",
@@ -95,9 +111,11 @@ ALLOWED = {
         "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
+        REMOTE,
         "later weighttraj.format.hdf5",
         "later weighttraj.load.windows",
         "later weighttraj.policies.policy",
+        "later weighttraj.remote",
     ],
     "weighttraj.format.export": [
         "weighttraj.errors",
@@ -113,7 +131,7 @@ ALLOWED = {
         "weighttraj.format.storage",
     ],
     "weighttraj.format.hdf5": [FORMAT, "weighttraj.errors"],
-    "weighttraj.format.integrity": [FORMAT, "weighttraj.errors"],
+    "weighttraj.format.integrity": [FORMAT, "weighttraj.errors", REMOTE],
     "weighttraj.format": [FORMAT],
     "weighttraj.environments": ["weighttraj.errors"],
     "weighttraj.collect": [
@@ -132,6 +150,7 @@ ALLOWED = {
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
+        REMOTE,
         "weighttraj.policies",
     ],
     "weighttraj.publish.film": [FORMAT, "weighttraj.publish"],
@@ -143,7 +162,7 @@ ALLOWED = {
         "weighttraj.policies",
         "weighttraj.publish",
     ],
-    "weighttraj.publish": ["weighttraj.errors", FORMAT, "weighttraj.publish"],
+    "weighttraj.publish": ["weighttraj.errors", FORMAT, REMOTE, "weighttraj.publish"],
     "weighttraj.publish.report": [
         "weighttraj.errors",
         FORMAT,
@@ -157,6 +176,7 @@ ALLOWED = {
     ],
     "weighttraj.load.windows": [
         "weighttraj.errors",
+        REMOTE,
         "door weighttraj.format",
         "weighttraj.load.cache",
     ],
@@ -183,16 +203,42 @@ ALLOWED = {
         "weighttraj.format.packing",
         "weighttraj.format.storage",
     ],
+    "weighttraj.registry.download": [
+        "weighttraj.errors",
+        "door weighttraj.format",
+        "weighttraj.format.catalog",
+        "weighttraj.format.locate",
+        "weighttraj.format.objects",
+        "weighttraj.format.packing",
+        "weighttraj.format.storage",
+        "weighttraj.remote",
+    ],
+    "weighttraj.registry.load": [
+        "weighttraj.errors",
+        "door weighttraj.format",
+        "weighttraj.format.locate",
+        "weighttraj.registry.download",
+        REMOTE,
+    ],
+    "weighttraj.registry.upload": [
+        "weighttraj.errors",
+        "weighttraj.format.lint",
+        "door weighttraj.format",
+        "weighttraj.format.catalog",
+        "weighttraj.format.locate",
+        "weighttraj.remote",
+    ],
     "weighttraj.cli": [
         "door weighttraj",
         "weighttraj.errors",
         "weighttraj.format.locate",
         "weighttraj.registry",
+        "weighttraj.remote",
         "later weighttraj.collect.recipe",
         "later weighttraj.load",
         "later weighttraj.publish.report",
     ],
-    "weighttraj": [FORMAT],
+    "weighttraj": [FORMAT, "weighttraj.remote"],
     "tipl.errors": ["weighttraj.errors"],
     "tipl.representation": ["tipl.errors", "tipl.representation", "door weighttraj"],
     "tipl.models": ["tipl.models"],

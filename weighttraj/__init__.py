@@ -29,6 +29,7 @@ from weighttraj.format import (
     unseal,
     verify,
 )
+from weighttraj.remote import Place
 
 __version__ = "0.1.0"
 
@@ -38,16 +39,19 @@ __all__ = [
     "Dataset",
     "Evaluation",
     "ParamLayout",
+    "Place",
     "Run",
     "RunInfo",
     "RunWriter",
     "collect",
+    "download",
     "export_hdf5",
     "export_npy",
     "export_safetensors",
     "import_hdf5",
     "lint",
     "load",
+    "load_dataset",
     "open",
     "open_dataset",
     "open_run",
@@ -59,16 +63,20 @@ __all__ = [
     "seal",
     "store_returns",
     "unseal",
+    "upload",
     "verify",
 ]
 
 _ROOMS = ("collect", "load", "policies", "publish", "registry")
+_REGISTRY = ("download", "load_dataset", "upload")
 _HDF5 = ("export_hdf5", "import_hdf5")
 
 
 def __getattr__(name: str) -> Any:
     if name in _ROOMS:
         return importlib.import_module(f"weighttraj.{name}")
+    if name in _REGISTRY:
+        return getattr(importlib.import_module("weighttraj.registry"), name)
     if name in _HDF5:
         return getattr(importlib.import_module("weighttraj.format.hdf5"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

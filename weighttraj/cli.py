@@ -19,6 +19,7 @@ import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import WeightTrajError
 from weighttraj.format.locate import locate
+from weighttraj.remote import is_remote
 
 app = tyro.extras.SubcommandApp()
 console = Console()
@@ -118,11 +119,17 @@ def _last_return(run: wt.Run) -> str:
 
 @app.command(name="show")
 def _show(
-    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set (path or id) or run")],
+    path: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="data set (path, id or address) or run")
+    ],
 ) -> None:
     """Print what a data set or a run holds."""
-    path = locate(path)
-    if (path / "dataset.json").is_file() or path.suffix == ".h5":
+    if is_remote(path):
+        is_run = path.removesuffix(".zip").endswith(".zarr")
+    else:
+        here = locate(path)
+        is_run = not (here / "dataset.json").is_file() and here.suffix != ".h5"
+    if not is_run:
         print(wt.open(path))
         return
     run = wt.open_run(path)
@@ -198,6 +205,64 @@ def _split(
 ) -> None:
     """Divide the runs of a data set anew, in a new data set."""
     print(registry.split(path, out, fractions=fractions, seed=seed, console=console))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Download:
+    address: tyro.conf.Positional[str]
+    """hf://organisation/name, s3://bucket/prefix, gs://, az://, https://, file://."""
+    out: Path | None = None
+    """Folder to be made. Default: where it is found by its name from then on."""
+    runs: tuple[str, ...] | None = None
+    """Only these runs, by id."""
+    steps: tuple[int, int] | None = None
+    """Only snapshots from one environment step to another one."""
+    arrays: tuple[str, ...] | None = None
+    """Beside the weights only these groups: critic, optimizer, probe, train, ret_norm, eval."""
+    revision: str | None = None
+    """Branch, tag or commit, on the hub."""
+
+
+@app.command(name="download")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _download(args: _Download) -> None:
+    """Bring a data set here, or a part of it; stopped, the same command goes on."""
+    dataset = registry.download(
+        args.address,
+        args.out,
+        runs=args.runs,
+        steps=args.steps,
+        arrays=args.arrays,
+        revision=args.revision,
+        console=console,
+    )
+    print(f"{len(dataset)} runs in {dataset.path}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Upload:
+    path: tyro.conf.Positional[str]
+    """Data set (path or id): complete, with a card and a licence."""
+    address: tyro.conf.Positional[str]
+    """hf://organisation/name, s3://bucket/prefix, gs://, az://, file://."""
+    despite_lint: bool = False
+    """Publish what looks suspicious; say why in the card."""
+    private: bool = False
+    """Of a new repository on the hub: only its organisation sees it."""
+
+
+@app.command(name="upload")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _upload(args: _Upload) -> None:
+    """Publish a data set, whole or not at all; stopped, the same command goes on."""
+    place = registry.upload(
+        args.path,
+        args.address,
+        despite_lint=args.despite_lint,
+        private=args.private,
+        console=console,
+    )
+    print(f"published: {place}")
 
 
 @app.command(name="delete")

@@ -92,8 +92,12 @@ class LoaderError(WeightTrajError, ValueError):
     """A loader's saved state does not fit the loader it is given to."""
 
 
+class RemoteError(WeightTrajError, OSError):
+    """A server cannot be reached, refuses, or answers what it should not."""
+
+
 class RegistryError(WeightTrajError, ValueError):
-    """Data sets that cannot be found, combined, split, searched or deleted as asked."""
+    """Data sets that cannot be found, combined, split, searched, published or deleted as asked."""
 
 
 class MissingExtraError(WeightTrajError, ImportError):

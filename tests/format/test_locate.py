@@ -56,5 +56,5 @@ def test_an_unknown_id_says_where_it_was_looked_for(
 
 def test_the_clones_data_sets_are_looked_through(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WEIGHTTRAJ_DATASETS_PATH", raising=False)
-    (clone,) = folders()
+    _, clone = folders()
     assert (clone / "demo" / "recipe.toml").is_file()

@@ -150,7 +150,7 @@ def _measure(tasks: Sequence[Task], workers: int, console: Console) -> list[Meas
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    measured: dict[Path, Measured] = {}
+    measured: dict[wt.Place, Measured] = {}
     with Progress(*columns, console=console) as progress, engine_of(workers) as engine:
         bars = {
             what: progress.add_task(what, total=total)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from tipl.evaluation.returns import FRESH, MODES, Player, forecast_returns, true
 from tipl.evaluation.starts import Starts, at_boundary, starts_of
 from tipl.evaluation.weights import Tick, divergences, squared_errors
 from tipl.forecast import Forecaster
-from weighttraj import Run, open_run
+from weighttraj import Place, Run, open_run
 from weighttraj.engine import Tell
 from weighttraj.threads import one_torch_thread
 
@@ -25,7 +24,7 @@ from weighttraj.threads import one_torch_thread
 class Task:
     """One run on which forecasters are judged."""
 
-    path: Path
+    path: Place
     """The run."""
     forecasters: tuple[Forecaster, ...]
     """Who is judged; the first one is the copy."""

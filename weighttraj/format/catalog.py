@@ -86,14 +86,21 @@ def write_manifest(path: Path) -> None:
 
 
 def read_manifest(path: Path) -> list[ManifestLine]:
-    """Lines of the manifest.
+    """Lines of the manifest of the data set in a folder; raises as ``parse_manifest`` does."""
+    return parse_manifest(FolderObjects(path).read(MANIFEST), path)
+
+
+def parse_manifest(content: bytes | None, where: object) -> list[ManifestLine]:
+    """Lines of a manifest.
+
+    Args:
+        content: of the file; None: there is none.
+        where: the data set, for messages.
 
     Raises:
         DamageError: it is missing, or a line is not as the format has it.
         FormatError: a path leads out of the data set.
     """
-    file = path / MANIFEST
-    content = FolderObjects(path).read(MANIFEST)
     try:
         if content is None:
             raise FileNotFoundError(MANIFEST)
@@ -103,31 +110,30 @@ def read_manifest(path: Path) -> list[ManifestLine]:
             "the data set is complete, but its manifest is missing or damaged",
             expected=MANIFEST,
             got=error,
-            where=path,
+            where=where,
             do="if a command that changes the data set was stopped, give it again; else restore "
             "the manifest from a copy, or write it again: weighttraj repair",
         ) from error
     lines = []
     for number, line in enumerate(text.split("\n")[:-1], start=1):
         match = _LINE.fullmatch(line)
+        place = f"{where}, {MANIFEST}, line {number}"
         if match is None or not text.endswith("\n"):
             raise DamageError(
                 "a line of the manifest is damaged",
                 expected="sha256, size and path, two spaces between them",
                 got=repr(line),
-                where=f"{file}, line {number}",
+                where=place,
                 do="restore it from a copy, or write it again: weighttraj repair",
             )
         lines.append(
-            ManifestLine(
-                sha256=match[1], size=int(match[2]), path=check_name(match[3], f"{file}:{number}")
-            )
+            ManifestLine(sha256=match[1], size=int(match[2]), path=check_name(match[3], place))
         )
     paths = [line.path for line in lines]
     if paths != sorted(set(paths)):
         raise DamageError(
             "the lines of the manifest are not in order, or a path is there twice",
-            where=file,
+            where=f"{where}, {MANIFEST}",
             do="restore it from a copy, or write it again: weighttraj repair",
         )
     return lines

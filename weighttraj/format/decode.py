@@ -82,6 +82,7 @@ class RowDecoder:
         out = self._empty(shape[::-1] if self._by_column else shape)
         target = out.T if self._by_column else out
         scratch = self._empty((math.prod(self._chunk),))
+        self._objects.expect([self._key(index) for index in itertools.product(*parts)])
         for index in itertools.product(*parts):
             for corner, content in self._encoded(index, bounds):
                 lows = [max(a, k) for (a, _), k in zip(bounds, corner, strict=True)]

@@ -30,6 +30,7 @@ from weighttraj.format.schema import AXES, RETURNS, Axis, load_json
 from weighttraj.format.storage import PACKED, RunStore, member_documents, object_grid
 from weighttraj.format.tables import write_tables
 from weighttraj.format.writer import lock_run
+from weighttraj.remote.address import here
 
 MONOTONE = ("index/iteration", "index/gradient_step", "index/num_timesteps")
 
@@ -47,7 +48,7 @@ def verify(path: str | Path, *, deep: bool = False) -> list[str]:
     Raises:
         FileNotFoundError: there is neither a data set nor a run at the path.
     """
-    path = Path(path)
+    path = here(path)
     try:
         if (path / "dataset.json").is_file():
             return _verify_dataset(open_dataset(path), deep)
@@ -75,7 +76,7 @@ def seal(path: str | Path) -> Dataset:
             do="give the command that collects it again: it goes on where it stopped",
         )
     write_tables(dataset)
-    write_manifest(dataset.path)
+    write_manifest(Path(dataset.path))
     return dataset
 
 
@@ -89,9 +90,10 @@ def unseal(path: str | Path) -> None:
         FileNotFoundError: there is no data set at the path.
         FormatError: it is none of this format.
     """
-    read_dataset_info(Path(path))
-    (Path(path) / MANIFEST).unlink(missing_ok=True)
-    sync(Path(path))
+    path = here(path)
+    read_dataset_info(path)
+    (path / MANIFEST).unlink(missing_ok=True)
+    sync(path)
 
 
 def repair(path: str | Path, *, cut: bool = False) -> list[str]:
@@ -111,7 +113,7 @@ def repair(path: str | Path, *, cut: bool = False) -> list[str]:
         FormatError: its own metadata is damaged; only a copy helps.
         StoreLockedError: a run is being written.
     """
-    path = Path(path)
+    path = here(path)
     if not (path / "dataset.json").is_file():
         return _repair_run(path, cut)
     info = read_dataset_info(path)
@@ -139,7 +141,7 @@ def check_manifest_quietly(path: Path) -> list[str]:
 
 def _verify_dataset(dataset: Dataset, deep: bool) -> list[str]:
     complete = dataset.info.status == "complete"
-    problems = check_manifest_quietly(dataset.path) if complete else []
+    problems = check_manifest_quietly(Path(dataset.path)) if complete else []
     for run in dataset:
         try:
             problems += _verify_run(run, deep=deep or not complete)
@@ -193,7 +195,7 @@ def _verify_objects(store: RunStore) -> Iterator[str]:
     yield from (f"{store.path}, {name}: missing" for name in sorted(expected - present))
     for name in sorted(present - expected) if store.info.status == "complete" else ():
         yield f"{store.path}, {name}: not part of what was committed (weighttraj repair removes it)"
-    if isinstance(store.objects, ZipObjects) and not same_as_packed(store.path):
+    if isinstance(store.objects, ZipObjects) and not same_as_packed(Path(store.path)):
         yield f"{store.path}: bytes of the zip file's own directory are damaged"
 
 
@@ -244,9 +246,10 @@ def _names(store: RunStore) -> Iterator[str]:
     if isinstance(store.objects, ZipObjects):
         yield from store.objects.names
         return
-    for file in store.path.rglob("*"):
+    folder = Path(store.path)
+    for file in folder.rglob("*"):
         if file.is_symlink() or not file.is_dir():
-            yield file.relative_to(store.path).as_posix()
+            yield file.relative_to(folder).as_posix()
 
 
 def _repair_entry(dataset: Path, entry: str, cut: bool) -> list[str]:

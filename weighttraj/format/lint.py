@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from weighttraj.format.reader import Run, open_dataset, open_run
+from weighttraj.remote.address import here
 
 JUMP = 30.0
 """A step is a discontinuity if it is so many times the median of the steps around it."""
@@ -47,7 +48,7 @@ def lint(path: str | Path) -> list[Finding]:
         FileNotFoundError: there is neither a data set nor a run at the path.
         DamageError: it is not whole: see ``verify``.
     """
-    path = Path(path)
+    path = here(path)
     runs = open_dataset(path).runs if (path / "dataset.json").is_file() else [open_run(path)]
     findings = [finding for run in runs for finding in lint_run(run)]
     return findings + list(_between(runs))

@@ -34,6 +34,7 @@ from weighttraj.format.storage import (
     object_grid,
     read_metadata,
 )
+from weighttraj.remote.address import Place
 
 # Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
 _EMPTY_CHUNKS = {"array.write_empty_chunks": True}
@@ -49,6 +50,11 @@ class LiveStore(RunStore):
         self._unsynced: set[Path] = set()
         self._writable: dict[str, zarr.Array[Any]] = {}
         self._encoders: dict[str, ObjectEncoder | None] = {}
+
+    @property
+    def path(self) -> Path:
+        """Folder of the run."""
+        return self.objects.path
 
     @classmethod
     def create(
@@ -78,7 +84,7 @@ class LiveStore(RunStore):
         return store
 
     @classmethod
-    def open(cls, path: Path) -> LiveStore:
+    def open(cls, path: Place) -> LiveStore:
         """Open a folder for writing. Rows that were written but not committed are forgotten.
 
         Raises:
@@ -87,7 +93,7 @@ class LiveStore(RunStore):
         """
         if path.name.endswith(PACKED):
             raise FormatError("a packed run is finished; nothing can be added", where=path)
-        objects = FolderObjects(path)
+        objects = FolderObjects(Path(path))
         store = cls(objects, read_metadata(objects))
         store.write_members()
         return store

@@ -6,6 +6,8 @@ import os
 import re
 from pathlib import Path
 
+from weighttraj.remote.address import RemotePath, is_remote
+
 VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
 """Environment variable: folders that hold data sets, as in PATH."""
 HOME = "~/.weighttraj/datasets"
@@ -23,8 +25,11 @@ def locate(path: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: the id is in none of them.
+        RegistryError: it is an address, and what is asked for needs files on this machine.
     """
     name = str(path)
+    if is_remote(name):
+        os.fspath(RemotePath.parse(name))  # raises, and says how to have it here
     if Path(path).exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
         return Path(path)
     places = [folder / name / part for folder in folders() for part in ("", "data")]

@@ -1,19 +1,22 @@
 """Where the bytes of a run are: objects under a name, in a folder or in one zip file.
 
-Nothing here keeps a file open, so objects survive fork, spawn and pickling.
+Nothing here keeps a file open, so objects survive fork, spawn and pickling. Those that are not on
+this machine are in ``format.remote``.
 """
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import stat
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from weighttraj.errors import DamageError, FormatError, StoreExistsError
+from weighttraj.errors import DamageError, FormatError, StoreExistsError, WeightTrajError
+from weighttraj.remote.address import Place
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
@@ -27,8 +30,9 @@ MAX_NAME = 200
 class Objects(Protocol):
     """Read-only objects by name, such as ``policy/weights/c/0/0``."""
 
-    path: Path
-    """Folder or file that holds them."""
+    @property
+    def path(self) -> Place:
+        """Folder or file that holds them."""
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """Bytes of an object, or a range of them; a negative start counts from the end.
@@ -38,6 +42,58 @@ class Objects(Protocol):
 
     def exists(self, name: str) -> bool:
         """Whether there is such an object."""
+
+    def expect(self, names: Sequence[str]) -> None:
+        """These will be read next, in this order: what is far away fetches them together."""
+
+
+@runtime_checkable
+class Blob(Protocol):
+    """The bytes of one file that does not change."""
+
+    @property
+    def path(self) -> Place:
+        """Where it is."""
+
+    @property
+    def size(self) -> int:
+        """How many bytes it has."""
+
+    def read(self, start: int, stop: int) -> bytes:
+        """Some of them."""
+
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
+        """These bytes, from start to stop, will be read next, in this order."""
+
+
+class FileBlob:
+    """A file on this machine, opened for each reading.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        status = path.stat()
+        self._inode, self.size = status.st_ino, status.st_size
+
+    def read(self, start: int, stop: int) -> bytes:
+        """See ``Blob``.
+
+        Raises:
+            FormatError: another file has taken its place.
+        """
+        handle = os.open(self.path, os.O_RDONLY)
+        try:
+            if os.fstat(handle).st_ino != self._inode:
+                raise replaced(self.path)
+            return _read_range(handle, 0, self.size, start, stop)
+        finally:
+            os.close(handle)
+
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
+        """See ``Blob``; the disk is near."""
 
 
 class FolderObjects:
@@ -66,6 +122,9 @@ class FolderObjects:
         """See ``Objects``."""
         return os.path.isfile(self.file(name))
 
+    def expect(self, names: Sequence[str]) -> None:
+        """See ``Objects``; the disk is near."""
+
     def file(self, name: str) -> str:
         """Path of an object, which is no link."""
         path = f"{self._root}/{check_name(name, self.path)}"
@@ -84,20 +143,23 @@ class FolderObjects:
 class ZipObjects:
     """Objects that are the members of one zip file, stored without compression.
 
+    Args:
+        blob: the file; or its path.
+
     Raises:
         DamageError: the file is no whole zip file.
         DamageError: a member reaches into another, or out of the file.
         FormatError: a member is compressed, encrypted, there twice or named like a path out.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, blob: Blob | Path) -> None:
+        self._blob: Blob = FileBlob(blob) if isinstance(blob, Path) else blob
+        path = self.path
         try:
-            with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-                self._inode = os.fstat(file.fileno()).st_ino
+            with zipfile.ZipFile(_BlobFile(self._blob)) as archive:
                 members, end = archive.infolist(), archive.start_dir
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
-            if isinstance(error, FileNotFoundError):
+            if isinstance(error, WeightTrajError | FileNotFoundError):
                 raise
             raise DamageError(
                 "the packed run is no whole zip file",
@@ -107,9 +169,10 @@ class ZipObjects:
             ) from error
         self._members: dict[str, tuple[int, int]] = {}
         self._ends: dict[str, int] = {}
+        self._starts: dict[str, int] = {}
         self.crc32 = {member.filename: member.CRC for member in members}
         """What the file's directory says of each object: the CRC-32 of its bytes."""
-        end = path.stat().st_size
+        end = self._blob.size
         for member in members:
             if not 0 <= member.header_offset <= end - 30 - member.file_size:
                 raise DamageError(
@@ -138,6 +201,11 @@ class ZipObjects:
             end = offset
 
     @property
+    def path(self) -> Place:
+        """Where the file is."""
+        return self._blob.path
+
+    @property
     def names(self) -> list[str]:
         """Names of all objects, in the order of the file."""
         return list(self._members)
@@ -146,31 +214,35 @@ class ZipObjects:
         """See ``Objects``."""
         if name not in self._members:
             return None
-        offset, size = self._members[name]
-        handle = os.open(self.path, os.O_RDONLY)
-        try:
-            if os.fstat(handle).st_ino != self._inode:
-                raise FormatError(
-                    "the packed run was replaced after it was opened",
-                    where=self.path,
-                    do="open it again",
-                )
-            header = os.pread(handle, 30, offset)
-            skip = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
-            first = offset + 30 + skip
-            if header[:4] != _LOCAL_HEADER or first + size > self._ends[name]:
-                raise self._misplaced(name, offset)
-            return _read_range(handle, first, size, start, stop)
-        finally:
-            os.close(handle)
+        self.expect([name])
+        first, size = self._start(name), self._members[name][1]
+        start = max(0, size + start) if start < 0 else start
+        stop = size if stop is None else min(stop, size)
+        return self._blob.read(first + start, first + stop) if start < stop else b""
 
     def exists(self, name: str) -> bool:
         """See ``Objects``."""
         return name in self._members
 
+    def expect(self, names: Sequence[str]) -> None:
+        """See ``Objects``."""
+        known = [name for name in names if name in self._members]
+        self._blob.expect([(self._members[name][0], self._ends[name]) for name in known])
+
     def size(self, name: str) -> int:
         """Bytes of an object that is there."""
         return self._members[name][1]
+
+    def _start(self, name: str) -> int:
+        """Where the bytes of an object begin: its own header says how long that is."""
+        if name not in self._starts:
+            offset, size = self._members[name]
+            header = self._blob.read(offset, offset + 30)
+            skip = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:], "little")
+            if header[:4] != _LOCAL_HEADER or offset + 30 + skip + size > self._ends[name]:
+                raise self._misplaced(name, offset)
+            self._starts[name] = offset + 30 + skip
+        return self._starts[name]
 
     def _misplaced(self, name: str, offset: int) -> DamageError:
         return DamageError(
@@ -179,6 +251,44 @@ class ZipObjects:
             where=f"{self.path}, {name}",
             do="restore the file from a copy, or collect the run again",
         )
+
+
+class _BlobFile(io.RawIOBase):
+    """A blob as the file that Python's ``zipfile`` reads the directory from."""
+
+    def __init__(self, blob: Blob) -> None:
+        self._blob, self._at = blob, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._blob.size}[whence]
+        if base + offset < 0:
+            raise OSError("before the first byte")  # as files say it: zipfile asks for it
+        self._at = base + offset
+        return self._at
+
+    def read(self, count: int = -1) -> bytes:
+        stop = self._blob.size if count < 0 else min(self._at + count, self._blob.size)
+        content = self._blob.read(self._at, stop) if self._at < stop else b""
+        self._at += len(content)
+        return content
+
+
+def replaced(where: object) -> FormatError:
+    """The error for a packed run that is not the one any more that was opened."""
+    return FormatError(
+        "the packed run was replaced after it was opened",
+        where=where,
+        do="open it again",
+    )
 
 
 def check_name(name: str, where: object) -> str:

@@ -5,15 +5,21 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from weighttraj.errors import FormatError
 from weighttraj.format.live import LiveStore
 from weighttraj.format.objects import ZipObjects, sync, write_zip
-from weighttraj.format.schema import AXES, Profile
+from weighttraj.format.schema import AXES, Profile, RunInfo, arrays_of
 from weighttraj.format.storage import PACKED, RunStore, group_document
+from weighttraj.remote.address import Place, RemotePath, here
+
+GROUPS = frozenset({"critic", "optimizer", "probe", "train", "ret_norm", "eval"})
+"""Arrays of a run that it can be without."""
 
 
 def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | None = None) -> Path:
@@ -34,7 +40,7 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
         FileNotFoundError: there is no run at the path.
         FormatError: the run is still being collected.
     """
-    source = RunStore.open(Path(path))
+    source = RunStore.open(here(path))
     if source.info.status == "collecting":
         raise FormatError(
             "only a finished run can be packed",
@@ -51,23 +57,100 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
             do="pip install --upgrade weighttraj, so that nothing is lost",
         )
     target = Path(out or str(path).removesuffix(PACKED) + PACKED)
+    _write(source, replace(source.info, profile=profile), slice(0, source.info.n_committed), target)
+    return target
+
+
+def cut(
+    path: str | Place,
+    out: Path,
+    *,
+    steps: tuple[int, int] | None = None,
+    arrays: Collection[str] | None = None,
+) -> Path:
+    """Pack a part of a finished run: some environment steps, some arrays.
+
+    Weights, digests, counters and the statistics of observations always come along: without these
+    a snapshot is none. What belongs to iterations, as probes do, comes from the first one on.
+
+    Args:
+        path: the run, here or at an address: what is not wanted is not read.
+        out: file to be written; it is replaced.
+        steps: first and last environment step of the snapshots; None: all.
+        arrays: groups that come along: ``critic``, ``optimizer``, ``probe``, ``train``,
+            ``ret_norm``, ``eval``; None: all that the run has.
+
+    Returns:
+        The file.
+
+    Raises:
+        FormatError: the run is still being collected, has no snapshot in these steps, or there is
+            no such group.
+    """
+    place = path if isinstance(path, RemotePath) else Path(path)
+    source = RunStore.open(place)
+    steps_of = source.read("index/num_timesteps", slice(None))
+    low, high = steps or (0, int(steps_of[-1]) if len(steps_of) else 0)
+    start, stop = int(np.searchsorted(steps_of, low)), int(np.searchsorted(steps_of, high, "right"))
+    unknown = sorted(set(arrays or ()) - GROUPS)
+    if source.info.status == "collecting" or start >= stop or unknown:
+        raise FormatError(
+            "this part of the run cannot be taken",
+            expected=f"a finished run, steps among {steps_of[:1]} to {steps_of[-1:]}, groups of "
+            f"arrays among {', '.join(sorted(GROUPS))}",
+            got=f"status {source.info.status}, steps {low} to {high}, unknown groups {unknown}",
+            where=place,
+            do="ask for another part",
+        )
+    info = _without(source.info, GROUPS - set(arrays)) if arrays is not None else source.info
+    last = int(source.read("index/iteration", stop - 1))
+    iterations = min(info.n_committed_iterations, last)
+    info = replace(info, n_committed=stop - start, n_committed_iterations=iterations)
+    _write(source, info, slice(start, stop), out)
+    return out
+
+
+def _without(info: RunInfo, groups: Collection[str]) -> RunInfo:
+    """The metadata of a run that lacks some groups of arrays."""
+    return replace(
+        info,
+        critic_layout=None if "critic" in groups else info.critic_layout,
+        optimizer_moments=info.optimizer_moments and "optimizer" not in groups,
+        probe_observations=0 if "probe" in groups else info.probe_observations,
+        diagnostics=() if "train" in groups else info.diagnostics,
+        ret_norm=info.ret_norm and "ret_norm" not in groups,
+        evaluation=None if "eval" in groups else info.evaluation,
+    )
+
+
+def _write(source: RunStore, info: RunInfo, snapshots: slice, target: Path) -> None:
+    """Write rows of a run into a new packed one, chunk by chunk, each read back and compared.
+
+    Args:
+        source: the run.
+        info: of the new one; it has some of the source's arrays.
+        snapshots: which of the source's.
+        target: the file.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
         live = LiveStore.create(
             Path(folder) / "run.zarr",
-            replace(source.info, n_committed=0, n_committed_iterations=0, profile=profile),
-            {axis: source.info.committed(axis) for axis in AXES},
+            replace(info, n_committed=0, n_committed_iterations=0),
+            {axis: info.committed(axis) for axis in AXES},
         )
-        for name, spec in source.specs.items():
-            rows, step = source.info.committed(spec.axis), live.chunk_rows(name)
+        for name, spec in arrays_of(info).items():
+            first = snapshots.start if spec.axis == "time" else 0
+            rows, step = info.committed(spec.axis), live.chunk_rows(name)
             for start in range(0, rows, step):
-                live.write(name, start, source.read(name, slice(start, min(start + step, rows))))
-        live.commit(replace(source.info, profile=profile))
+                some = slice(first + start, first + min(start + step, rows))
+                live.write(name, start, source.read(name, some))
+        live.commit(info)
         draft = Path(folder) / "run.zip"
         write_zip(draft, _members(live.path))
         sync(draft)
         draft.replace(target)
     sync(target.parent)
-    return target
 
 
 def copy_packed(path: Path, out: Path, run_id: str) -> None:
@@ -138,4 +221,4 @@ def _equal(one: Path, other: Path) -> bool:
     return True
 
 
-__all__ = ["copy_packed", "pack", "packed_order", "same_as_packed", "unpacked"]
+__all__ = ["GROUPS", "copy_packed", "cut", "pack", "packed_order", "same_as_packed", "unpacked"]

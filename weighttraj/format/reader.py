@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from weighttraj.errors import DamageError, FormatError
-from weighttraj.format.catalog import read_dataset_info
+from weighttraj.errors import DamageError, FormatError, RegistryError
+from weighttraj.format.catalog import DATASET, parse_dataset, read_dataset_info
 from weighttraj.format.layout import ParamLayout
 from weighttraj.format.locate import locate
 from weighttraj.format.objects import FolderObjects
@@ -26,6 +26,7 @@ from weighttraj.format.schema import (
     RunInfo,
 )
 from weighttraj.format.storage import RunStore
+from weighttraj.remote.address import Place, RemotePath, is_remote
 
 if TYPE_CHECKING:
     from weighttraj.load.windows import SnapshotDataset, WindowDataset
@@ -37,7 +38,7 @@ class ArrayStore(Protocol):
     """What a run is read from: a Zarr group (``storage``) or an HDF5 file (``hdf5``)."""
 
     @property
-    def path(self) -> Path:
+    def path(self) -> Place:
         """Where it lies."""
 
     @property
@@ -138,7 +139,7 @@ class Run:
     """
 
     def __init__(
-        self, path: Path, opener: Callable[[], ArrayStore], entry: RunEntry | None = None
+        self, path: Place, opener: Callable[[], ArrayStore], entry: RunEntry | None = None
     ) -> None:
         self.path = path
         self._opener = opener
@@ -350,7 +351,7 @@ class Run:
 class Dataset:
     """A data set, or a selection of its runs."""
 
-    def __init__(self, path: Path, info: DatasetInfo, runs: Sequence[Run]) -> None:
+    def __init__(self, path: Place, info: DatasetInfo, runs: Sequence[Run]) -> None:
         self.path = path
         self.info = info
         self.runs = list(runs)
@@ -431,22 +432,44 @@ class Dataset:
         return "\n".join(lines + [f"  {run.split or '-':<10} {run!r}" for run in self.runs])
 
 
-def open_dataset(path: str | Path) -> Dataset:
-    """Open a data set: a folder, one HDF5 file (``.h5``; needs the extra ``files``), or an id.
+def open_dataset(
+    path: str | Place, *, runs: Collection[str] | None = None, revision: str | None = None
+) -> Dataset:
+    """Open a data set: a folder, one HDF5 file (``.h5``), an id, or an address.
 
     Ids are looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH`` and in those of a clone. A
     data set that is still being collected opens too, with the runs that exist so far.
+
+    At an address (``hf://org/name``, ``s3://``, ``gs://``, ``az://``, ``https://``, ``file://``)
+    nothing is downloaded but what is read: the list of runs now, then parts of runs. HDF5 files
+    need the extra ``files``, addresses ``remote`` and the hub's ``hub``.
+
+    Args:
+        path: where it is.
+        runs: ids of the runs that are wanted; None: all.
+        revision: branch, tag or commit, of a data set on the hub; it is pinned to its commit.
 
     Raises:
         FileNotFoundError: there is no data set at the path.
         FormatError: it is none of this format, or a run is a link.
         DamageError: it is complete but lacks a run that it lists.
+        RegistryError: it has no run of such an id, or the address is none.
+        RemoteError: it is somewhere else, and cannot be reached.
     """
+    if isinstance(path, RemotePath) or is_remote(path):
+        place = path if isinstance(path, RemotePath) else RemotePath.parse(str(path), revision)
+        return _chosen(_open_remote(place), runs)
+    if revision is not None:
+        RemotePath.parse(f"file://{path}", revision)  # raises: no revisions here
     path = locate(path)
     if path.suffix == ".h5":
         from weighttraj.format.hdf5 import open_hdf5
 
-        return open_hdf5(path)
+        return _chosen(open_hdf5(path), runs)
+    return _chosen(_open_folder(path), runs)
+
+
+def _open_folder(path: Path) -> Dataset:
     info = read_dataset_info(path)
     runs, objects = [], FolderObjects(path)
     for entry in info.runs:
@@ -465,14 +488,60 @@ def open_dataset(path: str | Path) -> Dataset:
     return Dataset(path, info, runs)
 
 
-def open_run(path: str | Path) -> Run:
-    """Open one run: a folder ``<id>.zarr``, or a packed run ``<id>.zarr.zip``.
+def _open_remote(place: RemotePath) -> Dataset:
+    """The data set at an address; its runs are opened when they are first used."""
+    from weighttraj.remote.hub import pinned
+    from weighttraj.remote.store import store_at
+
+    if place.scheme == "hf":
+        place = pinned(place)
+    where = place / DATASET
+    content = store_at(place.root).read(where.part)
+    if content is None:
+        raise FileNotFoundError(f"no data set at {place}: it has no {DATASET}")
+    info = parse_dataset(content.content, where)
+    if info.status != "complete":
+        raise FormatError(
+            "the data set at this address is not complete",
+            expected="status complete, as `weighttraj upload` leaves it",
+            got=info.status,
+            where=place,
+            do="open it where it is being collected",
+        )
+    places = [place / entry.path for entry in info.runs]
+    pairs = zip(places, info.runs, strict=True)
+    return Dataset(place, info, [Run(p, partial(RunStore.open, p), entry) for p, entry in pairs])
+
+
+def _chosen(dataset: Dataset, runs: Collection[str] | None) -> Dataset:
+    if runs is None:
+        return dataset
+    known = [run.id for run in dataset]
+    if unknown := sorted(set(runs) - set(known)):
+        raise RegistryError(
+            "the data set has no such run",
+            expected=f"some of {', '.join(known)}",
+            got=", ".join(unknown),
+            where=dataset.path,
+            do="correct the ids of the runs",
+        )
+    return Dataset(dataset.path, dataset.info, [dataset[run] for run in runs])
+
+
+def open_run(path: str | Place) -> Run:
+    """Open one run: a folder ``<id>.zarr``, or a packed run ``<id>.zarr.zip``; also at an address.
 
     Raises:
         FileNotFoundError: there is no run at the path.
         FormatError: it is none of this format.
+        RemoteError: it is somewhere else, and cannot be reached.
     """
-    run = Run(Path(path), partial(RunStore.open, Path(path)))
+    place: Place
+    if isinstance(path, RemotePath) or is_remote(path):
+        place = path if isinstance(path, RemotePath) else RemotePath.parse(str(path)).as_object()
+    else:
+        place = Path(path)
+    run = Run(place, partial(RunStore.open, place))
     run._store  # noqa: B018  now, so that errors come from here
     return run
 

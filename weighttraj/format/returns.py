@@ -24,6 +24,7 @@ from weighttraj.format.storage import (
     member_documents,
 )
 from weighttraj.format.writer import lock_run
+from weighttraj.remote.address import here
 
 
 def store_returns(
@@ -53,7 +54,7 @@ def store_returns(
         StoreLockedError: another process is writing this run.
         DamageError: the run is damaged, or what was written does not read back.
     """
-    place = RunStore.open(Path(path)).path
+    place = Path(RunStore.open(here(path)).path)
     lock = lock_run(locked_path(place))
     try:
         store = RunStore.open(place)
@@ -79,7 +80,7 @@ def drop_returns(store: RunStore) -> None:
     if isinstance(store.objects, ZipObjects):
         _write_file(store, info, {})
     else:
-        LiveStore(FolderObjects(store.path), _metadata(store, info, {})).commit(info)
+        LiveStore(FolderObjects(Path(store.path)), _metadata(store, info, {})).commit(info)
 
 
 def locked_path(path: Path) -> Path:
@@ -117,7 +118,7 @@ def _checked(
     return {n: np.ascontiguousarray(v) for n, v in zip(RETURNS, pair, strict=True)}
 
 
-def _check_values(returns: np.ndarray, lengths: np.ndarray, where: Path) -> None:
+def _check_values(returns: np.ndarray, lengths: np.ndarray, where: object) -> None:
     reasons = {
         "infinite returns": np.isinf(returns),
         "lengths that are no number of steps": (lengths < -1) | (lengths > 2**31 - 1),
@@ -162,7 +163,7 @@ def _write_folder(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarra
     """Write the chunks, then the metadata of single arrays; the group's are the commit."""
     with tempfile.TemporaryDirectory() as folder:
         documents = _documents(Path(folder) / "run.zarr", info, None)
-    live = LiveStore(FolderObjects(store.path), _metadata(store, info, documents))
+    live = LiveStore(FolderObjects(Path(store.path)), _metadata(store, info, documents))
     _write_arrays(live, values)
     live.write_members(durable=True)
     live.commit(info)
@@ -170,7 +171,7 @@ def _write_folder(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarra
 
 def _write_file(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]) -> None:
     """Write a packed run anew: with these returns, or with none."""
-    path = store.path
+    path = Path(store.path)
     folder = path.with_name(f".{path.name}.returns.draft")
     shutil.rmtree(folder, ignore_errors=True)  # of a killed process
     try:
@@ -251,7 +252,7 @@ def _compare(
     Raises:
         DamageError: it does not.
     """
-    draft = ZipObjects(store.path)
+    draft = ZipObjects(Path(store.path))
     bad = [
         name
         for name in kept

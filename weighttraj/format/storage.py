@@ -21,6 +21,7 @@ from weighttraj.format.objects import (
     check_name,
 )
 from weighttraj.format.schema import RunInfo, arrays_of, load_json, parse, to_json
+from weighttraj.remote.address import Place, RemotePath
 
 ATTRIBUTE = "weighttraj"
 """Key of the run's metadata in the attributes of its Zarr group."""
@@ -65,16 +66,17 @@ class RunStore:
         self._decoders: dict[str, RowDecoder] = {}
 
     @property
-    def path(self) -> Path:
+    def path(self) -> Place:
         """Where the run lies."""
         return self.objects.path
 
     @classmethod
-    def open(cls, path: Path) -> RunStore:
+    def open(cls, path: Place) -> RunStore:
         """Open an existing run.
 
         Raises:
             FileNotFoundError: there is no run at the path.
+            RemoteError: it is somewhere else, and cannot be reached.
             FormatError: it is no run of this format.
         """
         objects = objects_at(path)
@@ -140,13 +142,17 @@ class RunStore:
         return {**self.__dict__, "_decoders": {}}
 
 
-def objects_at(path: Path) -> FolderObjects | ZipObjects:
+def objects_at(path: Place) -> Objects:
     """The objects of a run in a folder or in a zip file; a folder's name finds the file it became.
 
     Raises:
         FileNotFoundError: there is none.
         FormatError: it is a file, but no packed run.
     """
+    if isinstance(path, RemotePath):
+        from weighttraj.format.remote import remote_objects
+
+        return remote_objects(path)
     packed = path.with_name(path.name + PACKED)
     if path.is_file() or (packed.is_file() and not path.exists()):
         return ZipObjects(path if path.is_file() else packed)

@@ -32,15 +32,16 @@ def write_tables(dataset: Dataset) -> None:
         import pyarrow as pa
     except ModuleNotFoundError as error:
         raise missing_extra("pyarrow", "files") from error
-    (dataset.path / "tables").mkdir(exist_ok=True)
+    folder = Path(dataset.path)
+    (folder / "tables").mkdir(exist_ok=True)
     runs = pa.Table.from_pylist([run_row(run) for run in dataset])
     if "final_mean_return" in runs.column_names:  # not a type of its own where all are null
         index = runs.column_names.index("final_mean_return")
         values = runs.column(index).cast(pa.float64())
         runs = runs.set_column(index, "final_mean_return", values)
-    _write(dataset.path / RUNS, runs)
+    _write(folder / RUNS, runs)
     parts = [pa.table(snapshot_columns(run)) for run in dataset]
-    _write(dataset.path / SNAPSHOTS, pa.concat_tables(parts, promote_options="default"))
+    _write(folder / SNAPSHOTS, pa.concat_tables(parts, promote_options="default"))
 
 
 def run_row(run: Run) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 from weighttraj.errors import WindowError
 from weighttraj.format import Run
 from weighttraj.load.cache import CachedWeights
+from weighttraj.remote.address import RemotePath
 
 MAX_MAPS = 200
 """Runs that one data set keeps mapped: each takes a file handle, and processes may have 1024."""
@@ -67,6 +68,9 @@ class RunDataset(Dataset[Item]):
         """int64 (item, 2): position of the run in ``runs``, and t."""
         self._ids = [run.id for run in runs]
         self._cached = [CachedWeights(run) for run in runs]
+        for cached in self._cached:
+            if isinstance(cached.run.path, RemotePath):
+                cached.map()  # now: a forked worker could not read it
         self._maps: dict[int, np.ndarray] = {}
 
     @cached_property

@@ -38,6 +38,7 @@ from weighttraj.format.storage import PACKED
 from weighttraj.policies.batch import load_policies
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 from weighttraj.policies.simulators import GymnasiumSimulator
+from weighttraj.remote.address import here
 
 Mode = Literal["deterministic", "sampled"]
 
@@ -133,7 +134,7 @@ def fill_returns(
         StoreLockedError: somebody else is doing the same.
         KeyboardInterrupt: it was stopped; what was played stays.
     """
-    path, config = Path(path).absolute(), config or ReturnsConfig()
+    path, config = here(path).absolute(), config or ReturnsConfig()
     console = console or Console(quiet=True)
     read_dataset_info(path)  # before a lock is put beside it: is there one?
     with engine_of(workers, scheduler) as engine, _only_one(path.resolve()):
@@ -185,7 +186,7 @@ class _Work:
         """The missing snapshots in blocks."""
         for start in range(0, len(self.missing), BLOCK):
             rows = self.missing[start : start + BLOCK]
-            yield _Task(path=self.run.path, rows=rows, config=self.config)
+            yield _Task(path=Path(self.run.path), rows=rows, config=self.config)
 
     def add(self, rows: list[int], played: EpisodeReturns) -> None:
         """Keep the outcome of a block; store everything in the run if it was the last."""
@@ -201,7 +202,7 @@ class _Work:
         returns, lengths = np.full(shape, np.nan), np.full(shape, -1, np.int64)
         for row, (row_returns, row_lengths) in self.played.items():
             returns[row], lengths[row] = row_returns, row_lengths
-        store_returns(self.run.path, self.evaluation, returns, lengths)
+        store_returns(Path(self.run.path), self.evaluation, returns, lengths)
         self._journal.remove()
 
     def _stored(self, *, replace: bool) -> _Played:
@@ -287,7 +288,8 @@ class _Journal:
 
 def _finished(dataset: Dataset, console: Console) -> list[Run]:
     """Runs that will not change; a folder that is packed, but not yet listed so, is about to go."""
-    packed = {run.id for run in dataset if run.path.with_name(f"{run.path.name}{PACKED}").is_file()}
+    places = {run.id: Path(run.path) for run in dataset}
+    packed = {i for i, p in places.items() if p.with_name(f"{p.name}{PACKED}").is_file()}
     ended = [run for run in dataset if run.info.status != "collecting"]
     done = [run for run in ended if run.id not in packed]
     if skipped := [run.id for run in dataset if run not in done]:

@@ -12,6 +12,7 @@ from weighttraj.errors import FormatError
 from weighttraj.format import Algorithm, Run, open_dataset, open_run
 from weighttraj.format.schema import DatasetInfo
 from weighttraj.publish.curves import final_return
+from weighttraj.remote.address import here
 
 MINUS, DASH = "\u2212", "\u2013"
 
@@ -45,7 +46,7 @@ def open_source(path: str | Path) -> Source:
         FileNotFoundError: there is neither at the path.
         FormatError: it is none of this format, or a data set that has no run yet.
     """
-    path = Path(path)
+    path = here(path)
     if not ((path / "dataset.json").is_file() or path.suffix == ".h5"):
         run = open_run(path)
         return Source(path=path, id=run.id, info=None, runs=[run])

@@ -1,11 +1,26 @@
-"""Data sets by their ids: which are here, what they hold, and new ones.
+"""Data sets by their ids: which are here, what they hold, new ones, and those elsewhere.
 
 ``local`` finds and deletes, ``search`` asks all runs of all data sets, ``derive`` makes a data set
-of runs, or of others.
+of runs, or of others; ``upload`` publishes one, ``download`` brings one here, and ``load`` opens it
+by its name, wherever it is.
 """
 
 from weighttraj.registry.derive import combine, create, split
+from weighttraj.registry.download import download
+from weighttraj.registry.load import load_dataset
 from weighttraj.registry.local import LocalDataset, delete, local_datasets
 from weighttraj.registry.search import search
+from weighttraj.registry.upload import upload
 
-__all__ = ["LocalDataset", "combine", "create", "delete", "local_datasets", "search", "split"]
+__all__ = [
+    "LocalDataset",
+    "combine",
+    "create",
+    "delete",
+    "download",
+    "load_dataset",
+    "local_datasets",
+    "search",
+    "split",
+    "upload",
+]

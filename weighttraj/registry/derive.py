@@ -168,11 +168,11 @@ def split(
 
 def _complete(path: str | Path) -> Dataset:
     dataset = open_dataset(path)
-    if dataset.info.status != "complete" or dataset.path.is_file():
+    if dataset.info.status != "complete" or Path(dataset.path).is_file():
         raise RegistryError(
             "only a complete data set in a folder can be made into another one",
             expected="status complete",
-            got="an HDF5 file" if dataset.path.is_file() else dataset.info.status,
+            got="an HDF5 file" if Path(dataset.path).is_file() else dataset.info.status,
             where=dataset.path,
             do="finish collecting it, or import the file first",
         )
@@ -233,7 +233,8 @@ def _write(
 
 def _copy(run: Run, target: Path, run_id: str) -> None:
     """Byte for byte where the id stays; with other metadata where it does not."""
-    packed = run.path if run.path.is_file() else pack(run.path, out=target)
+    path = Path(run.path)
+    packed = path if path.is_file() else pack(path, out=target)
     if run_id != run.id:
         copy_packed(packed, target, run_id)
     elif packed != target:

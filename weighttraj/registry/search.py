@@ -55,7 +55,7 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
         return rows
     try:
         fits = rows.eval(query, engine="python")
-        if not pd.api.types.is_bool_dtype(fits):
+        if not isinstance(fits, pd.Series) or not pd.api.types.is_bool_dtype(fits):
             raise TypeError("this is no condition")
     except Exception as error:  # the parser's, Python's, numpy's: whatever a user can type
         raise RegistryError(
@@ -65,7 +65,7 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
             do="quote text, and put names with a point between backticks: "
             "\"env == 'HalfCheetah-v4' and `hyperparameters.gamma` < 1\"",
         ) from error
-    return rows[fits].reset_index(drop=True)
+    return rows.loc[fits].reset_index(drop=True)
 
 
 __all__ = ["search"]

@@ -1,0 +1,128 @@
+"""A small data set that is fit to be published, and servers that have it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import boto3
+import pytest
+
+import weighttraj as wt
+from tests.remote import servers
+from weighttraj.registry import create
+
+CREDENTIALS = {"aws_access_key_id": "key", "aws_secret_access_key": "secret"}
+
+
+@pytest.fixture(autouse=True)
+def patient_for_seconds_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A server that is gone is waited for a minute; not here. Downloads go to a test's store."""
+    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "2")
+    monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(tmp_path / "store"))
+
+
+@pytest.fixture(scope="session")
+def published(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small data set with a card. Do not write to it."""
+    path = tmp_path_factory.mktemp("published") / "small-v1"
+    shutil.copytree(small_dataset, path)
+    (path / "README.md").write_text("# A small data set\n")
+    wt.seal(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs of the released data, which are read in parts. Do not write to it."""
+    path = tmp_path_factory.mktemp("large") / "large-v1"
+    released = wt.open("inverted-pendulum-v4-ppo-v1")
+    create([str(released.runs[i].path) for i in (0, 1)], path, splits={"seed0001": "test"})
+    (path / "README.md").write_text("# Two runs of the released data\n")
+    wt.seal(path)
+    return path
+
+
+@pytest.fixture
+def large_server(large: Path) -> Iterator[servers.FileServer]:
+    with servers.FileServer(large.parent) as server:
+        yield server
+
+
+@pytest.fixture
+def server(published: Path) -> Iterator[servers.FileServer]:
+    with servers.FileServer(published.parent) as server:
+        yield server
+
+
+@dataclass
+class Bucket:
+    """A bucket of an S3 server."""
+
+    url: str
+    name: str
+
+    @property
+    def address(self) -> str:
+        return f"s3://{self.name}"
+
+
+@pytest.fixture(scope="session")
+def moto_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with servers.moto(tmp_path_factory.mktemp("moto")) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def seaweedfs_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with servers.seaweedfs(tmp_path_factory.mktemp("weed")) as url:
+        yield url
+
+
+@pytest.fixture(params=["moto", "seaweedfs"])
+def bucket(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Bucket:
+    """A new bucket, on each of two servers."""
+    url = request.getfixturevalue(f"{request.param}_url")
+    return make_bucket(url, f"{request.param}-{tmp_path.name}".replace("_", "-"), monkeypatch)
+
+
+@pytest.fixture
+def moto_bucket(moto_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bucket:
+    return make_bucket(moto_url, tmp_path.name.replace("_", "-"), monkeypatch)
+
+
+def make_bucket(url: str, name: str, monkeypatch: pytest.MonkeyPatch) -> Bucket:
+    name = name.lower()[-50:].strip("-")
+    for variable, value in {
+        "AWS_ACCESS_KEY_ID": CREDENTIALS["aws_access_key_id"],
+        "AWS_SECRET_ACCESS_KEY": CREDENTIALS["aws_secret_access_key"],
+        "AWS_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": url,
+        "AWS_ALLOW_HTTP": "true",
+    }.items():
+        monkeypatch.setenv(variable, value)
+    client = boto3.client("s3", endpoint_url=url, region_name="us-east-1", **CREDENTIALS)
+    client.create_bucket(Bucket=name)
+    return Bucket(url, name)
+
+
+def objects_of(bucket: Bucket) -> dict[str, bytes]:
+    """All that lies in a bucket, by another client than ours."""
+    client = boto3.client("s3", endpoint_url=bucket.url, region_name="us-east-1", **CREDENTIALS)
+    listed = client.list_objects_v2(Bucket=bucket.name).get("Contents", [])
+    return {
+        o["Key"]: client.get_object(Bucket=bucket.name, Key=o["Key"])["Body"].read() for o in listed
+    }
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """All that lies in a folder, but for hidden files."""
+    return {
+        file.relative_to(folder).as_posix(): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file() and not file.name.startswith(".")
+    }

@@ -1,0 +1,328 @@
+"""Brings a data set here, or a part of it; goes on where it was stopped, and checks every byte."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+from collections.abc import Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+
+from weighttraj.errors import DamageError, FormatError, RemoteError, StoreLockedError
+from weighttraj.format import Dataset, RunEntry, open_dataset, seal
+from weighttraj.format.catalog import (
+    MANIFEST,
+    ManifestLine,
+    parse_manifest,
+    write_dataset_info,
+)
+from weighttraj.format.locate import folders
+from weighttraj.format.objects import refuse_existing, replace_file
+from weighttraj.format.packing import cut
+from weighttraj.format.storage import PACKED
+from weighttraj.remote.address import RemotePath
+from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
+
+SOURCE = ".source.json"
+"""File in a downloaded data set that says where it is from; no object of the data set."""
+AT_ONCE = 4
+"""Files that are fetched at the same time."""
+TRIES = 5
+"""Times that a file is gone on with after an answer broke off without a byte."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a data set was downloaded from."""
+
+    repository: str
+    """Address without a revision."""
+    revision: str | None = None
+    """Revision that was asked for; None: none was."""
+    commit: str | None = None
+    """Commit that this was, on the hub."""
+
+
+def download(
+    address: str,
+    out: str | Path | None = None,
+    *,
+    runs: Collection[str] | None = None,
+    steps: tuple[int, int] | None = None,
+    arrays: Collection[str] | None = None,
+    revision: str | None = None,
+    console: Console | None = None,
+) -> Dataset:
+    """Download a data set, or some of its runs, steps or arrays.
+
+    Every file is compared with its hash in the manifest, every snapshot of a part with its digest.
+    Stopped at any moment, the same call goes on with what is there; the data set appears under
+    its name when it is whole. A part of one is a data set of its own, which says what it is of.
+
+    Args:
+        address: ``hf://org/name``, ``s3://bucket/prefix``, ``https://``...
+        out: folder to be made; None: where it is found by its id from then on.
+        runs: ids of the runs that are wanted; None: all.
+        steps: first and last environment step of the snapshots that are wanted; None: all.
+        arrays: groups of arrays that are wanted beside the weights: ``critic``, ``optimizer``,
+            ``probe``, ``train``, ``ret_norm``, ``eval``; None: all.
+        revision: branch, tag or commit, of a data set on the hub.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        FileNotFoundError: there is no data set at the address.
+        RegistryError: it has no run of such an id, or the address is none.
+        StoreExistsError: the folder exists, and is not this data set.
+        StoreLockedError: another process is downloading it.
+        DamageError: a file there is not what the manifest says.
+        RemoteError: it cannot be reached; what came is kept.
+    """
+    place = RemotePath.parse(address, revision)
+    dataset = open_dataset(place, runs=runs)
+    assert isinstance(dataset.path, RemotePath)  # noqa: S101
+    store, at = store_at(dataset.path.root), dataset.path
+    manifest = store.read((at / MANIFEST).part)
+    lines = parse_manifest(None if manifest is None else manifest.content, at)
+    content = manifest.content if manifest else b""
+    target = Path(out) if out is not None else home() / name_of(place)
+    part = runs is not None or steps is not None or arrays is not None
+    here = target / MANIFEST
+    if not part and here.is_file() and here.read_bytes() == content:
+        return open_dataset(target)
+    refuse_existing(target)
+    draft = target.with_name(f".{target.name}.download")
+    with _kept(draft):
+        if steps is None and arrays is None:
+            chosen = {entry.path for entry in _entries(dataset)} if part else None
+            wanted = [line for line in lines if chosen is None or line.path in chosen]
+            _fetch_all(store, at, wanted, draft, console or Console(quiet=True))
+        else:
+            _cut_all(dataset, draft, steps, arrays, console or Console(quiet=True))
+        if part:
+            _list_part(dataset, draft, steps, arrays)
+        else:
+            replace_file(draft / MANIFEST, content)
+        source = Source(at.repository, revision, at.commit)
+        replace_file(draft / SOURCE, json.dumps(asdict(source)).encode())
+        draft.rename(target)
+    return open_dataset(target)
+
+
+def home() -> Path:
+    """Where data sets are put that are downloaded."""
+    return folders()[0]
+
+
+def name_of(place: RemotePath) -> str:
+    """What a data set is called here: ``org/name`` on the hub, else the address's last part."""
+    repository = place.repository
+    return repository.removeprefix("hf://") if place.scheme == "hf" else place.name
+
+
+def source_of(path: Path) -> Source | None:
+    """Where a data set on this machine was downloaded from; None: it was not."""
+    try:
+        return Source(**json.loads((path / SOURCE).read_bytes()))
+    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError):
+        return None
+
+
+def _entries(dataset: Dataset) -> list[RunEntry]:
+    """The lines of the list of runs that are those of the runs opened."""
+    ids = {run.id for run in dataset}
+    return [entry for entry in dataset.info.runs if entry.id in ids]
+
+
+def _fetch_all(
+    store: RemoteStore, at: RemotePath, lines: list[ManifestLine], draft: Path, console: Console
+) -> None:
+    with _progress(console, sum(line.size for line in lines)) as (progress, task):
+
+        def fetch(line: ManifestLine) -> None:
+            _fetch(store, (at / line.path).part, line, draft / line.path, progress, task)
+
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            futures = [pool.submit(fetch, line) for line in lines]
+            try:
+                for future in futures:
+                    future.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+
+def _fetch(
+    store: RemoteStore,
+    name: str,
+    line: ManifestLine,
+    file: Path,
+    progress: Progress,
+    task: TaskID,
+) -> None:
+    """Fetch one file, from the byte on that is missing."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.is_file() and _sha256(file).hexdigest() == line.sha256:
+        progress.advance(task, line.size)
+        return
+    part = file.with_name(f".{file.name}.part")
+    digest = ""
+    for fresh in (False, True):
+        if fresh:
+            part.unlink(missing_ok=True)  # what was there is of other bytes
+        try:
+            digest = _append(store, name, line, part, progress, task)
+        except NoPartsError:
+            if fresh:
+                raise
+            progress.advance(task, -part.stat().st_size)
+            continue
+        if digest == line.sha256:
+            part.replace(file)
+            return
+        progress.advance(task, -line.size)
+    part.unlink()
+    raise DamageError(
+        "a file at the address is not what the manifest says",
+        expected=f"{line.size} bytes, sha256 {line.sha256}",
+        got=f"sha256 {digest}",
+        where=RemotePath(store.root, name),
+        do="tell those who published it; nothing of this file was kept",
+    )
+
+
+def _append(
+    store: RemoteStore, name: str, line: ManifestLine, part: Path, progress: Progress, task: TaskID
+) -> str:
+    """Add to a file what it lacks; returns the hash of all of it."""
+    if part.is_file() and part.stat().st_size > line.size:
+        part.unlink()
+    digest = _sha256(part) if part.is_file() else hashlib.sha256()
+    done = part.stat().st_size if part.is_file() else 0
+    progress.advance(task, done)
+    failed = 0
+    with part.open("ab") as file:
+        while done < line.size:
+            before = done
+            try:
+                for piece in store.pieces(name, done):
+                    file.write(piece)
+                    digest.update(piece)
+                    done += len(piece)
+                    progress.advance(task, len(piece))
+                    if done > line.size:
+                        break
+            except FileNotFoundError as error:
+                raise DamageError(
+                    "a file that the manifest lists is not at the address",
+                    where=RemotePath(store.root, name),
+                    do="tell those who published it",
+                ) from error
+            except BrokenOffError:
+                failed = 0 if done > before else failed + 1
+                if failed == TRIES:
+                    raise
+            else:
+                break
+    return digest.hexdigest()
+
+
+def _cut_all(
+    dataset: Dataset,
+    draft: Path,
+    steps: tuple[int, int] | None,
+    arrays: Collection[str] | None,
+    console: Console,
+) -> None:
+    """Read a part of each run from where it is, and pack it here."""
+    with Progress(console=console, disable=console.quiet) as progress:
+        for run in progress.track(dataset.runs, description="runs"):
+            target = draft / "runs" / f"{run.id}.zarr{PACKED}"
+            if not target.is_file():  # a packed run appears when it is whole
+                cut(run.path, target, steps=steps, arrays=arrays)
+
+
+def _list_part(
+    dataset: Dataset,
+    draft: Path,
+    steps: tuple[int, int] | None,
+    arrays: Collection[str] | None,
+) -> None:
+    """Make a data set of a part of one."""
+    entries = tuple(
+        replace(entry, path=f"runs/{entry.id}.zarr{PACKED}")
+        if (draft / f"runs/{entry.id}.zarr{PACKED}").is_file()
+        else entry
+        for entry in _entries(dataset)
+    )
+    wanted = {entry.path for entry in entries}
+    for file in (draft / "runs").iterdir():  # of a download that was stopped, of other runs
+        if f"runs/{file.name}" not in wanted:
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
+    recipe: dict[str, Any] = {
+        "part": {
+            "id": dataset.info.id,
+            "version": dataset.info.version,
+            "runs": f"{len(entries)} of {len(dataset.info.runs)}",
+            "steps": None if steps is None else list(steps),
+            "arrays": None if arrays is None else sorted(arrays),
+        }
+    }
+    write_dataset_info(draft, replace(dataset.info, runs=entries, recipe=recipe))
+    seal(draft)
+
+
+@contextlib.contextmanager
+def _kept(draft: Path) -> Iterator[None]:
+    """A folder that one process works in, and that stays if it does not come to its end."""
+    try:
+        draft.mkdir(parents=True, exist_ok=True)
+        with FileLock(draft.with_name(f"{draft.name}.lock"), timeout=0) as lock:
+            yield
+        Path(lock.lock_file).unlink(missing_ok=True)
+    except Timeout as error:
+        raise StoreLockedError(
+            "another process is downloading this data set",
+            where=draft,
+            do="wait for it",
+        ) from error
+    except OSError as error:
+        if isinstance(error, RemoteError | FileNotFoundError):
+            raise
+        raise FormatError(
+            "the data set could not be written; what came is kept",
+            got=error,
+            where=draft,
+            do="make room, and give the command again: it goes on",
+        ) from error
+
+
+@contextlib.contextmanager
+def _progress(console: Console, total: int) -> Iterator[tuple[Progress, TaskID]]:
+    columns = (TextColumn("download"), BarColumn(), DownloadColumn())
+    speed = (TransferSpeedColumn(), TimeRemainingColumn())
+    with Progress(*columns, *speed, console=console, disable=console.quiet) as progress:
+        yield progress, progress.add_task("download", total=total)
+
+
+def _sha256(file: Path) -> Any:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256")
+
+
+__all__ = ["SOURCE", "Source", "download", "home", "name_of", "source_of"]

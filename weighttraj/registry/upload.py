@@ -1,0 +1,207 @@
+"""Publishes a data set: all of it or nothing, as readers see it, and never over another one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+
+from weighttraj.errors import RegistryError
+from weighttraj.format import Dataset, lint, open_dataset, verify
+from weighttraj.format.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
+from weighttraj.format.locate import locate
+from weighttraj.remote.address import RemotePath
+from weighttraj.remote.hub import client, hub_error, pinned
+from weighttraj.remote.store import RemoteStore, store_at
+
+CLAIM = "UPLOADING.sha256"
+"""Object that holds the manifest of what is being uploaded, for as long as it is."""
+CARD = "README.md"
+AT_ONCE = 4
+"""Files that are sent at the same time."""
+
+
+def upload(
+    path: str | Path,
+    address: str,
+    *,
+    despite_lint: bool = False,
+    private: bool = False,
+    console: Console | None = None,
+) -> RemotePath:
+    """Publish a data set, so that it can be opened and downloaded by an address.
+
+    First it is verified, and looked at for what is suspicious. Readers see nothing of it until it
+    is whole: on the hub it is one commit, with the tag ``v<version>``; elsewhere ``dataset.json``,
+    which every reader begins with, is written last, after the manifest. Stopped at any moment, the
+    same call goes on. What was published stays as it is: other data are another version (on the
+    hub) or another address.
+
+    Args:
+        path: a complete data set on this machine, path or id, with a card and a licence.
+        address: ``hf://org/name``, ``s3://bucket/prefix``, ``gs://``, ``az://``, ``file://``.
+        despite_lint: publish what looks suspicious; say why in the card.
+        private: of a new repository on the hub: only its organisation sees it.
+        console: where progress is shown; None: nowhere.
+
+    Returns:
+        Where it is.
+
+    Raises:
+        FileNotFoundError: there is no such data set.
+        RegistryError: it is not fit to be published, other data are there or are being uploaded
+            there, or nothing can be written there.
+        RemoteError: the address cannot be reached.
+    """
+    place = RemotePath.parse(address)
+    dataset = open_dataset(locate(path))
+    folder = Path(dataset.path)
+    _check(dataset, folder, despite_lint)
+    console = console or Console(quiet=True)
+    if place.scheme == "hf":
+        return _upload_to_hub(dataset, folder, place, private)
+    if place.scheme in ("http", "https"):
+        raise RegistryError(
+            "web servers can only be read from",
+            expected="hf://, s3://, gs://, az:// or file://",
+            got=address,
+            do="copy the data set's folder to where the server finds it",
+        )
+    if place.scheme == "file":
+        Path(place.root.removeprefix("file://")).mkdir(parents=True, exist_ok=True)
+    return _upload_objects(folder, place, console)
+
+
+def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
+    """Whether a data set is fit to be published."""
+    if folder.is_file() or dataset.info.status != "complete" or not dataset.info.licence:
+        raise RegistryError(
+            "only a complete data set with a licence can be published",
+            expected="a folder, status complete, a licence such as CC-BY-4.0",
+            got=f"status {dataset.info.status}, licence {dataset.info.licence!r}",
+            where=folder,
+            do="finish collecting it; name the licence in the recipe",
+        )
+    if not (folder / CARD).is_file():
+        raise RegistryError(
+            "a data set is published with a card that says what it is",
+            expected=f"{CARD} in its folder",
+            got="none",
+            where=folder,
+            do=f"weighttraj card {folder}",
+        )
+    if problems := verify(folder):
+        raise RegistryError(
+            "the data set is damaged",
+            got="\n    ".join(problems[:5]),
+            where=folder,
+            do="weighttraj verify, then weighttraj repair",
+        )
+    if not despite_lint and (findings := [str(finding) for finding in lint(folder)]):
+        raise RegistryError(
+            "the data set looks suspicious",
+            got="\n    ".join(findings[:5]),
+            where=folder,
+            do="correct it; if it is meant so, say so in the card and give --despite-lint",
+        )
+
+
+def _upload_objects(folder: Path, place: RemotePath, console: Console) -> RemotePath:
+    """Write objects one by one; a claim says whose they are until the last one is written."""
+    store, manifest = store_at(place.root), (folder / MANIFEST).read_bytes()
+    claimed = store.write(CLAIM, manifest, new=True)
+    if not claimed and (there := store.read(CLAIM)) is not None and there.content != manifest:
+        raise RegistryError(
+            "other data are being uploaded to this address, or were, when it was stopped",
+            expected="nothing, or the same data set",
+            got=CLAIM,
+            where=place,
+            do="wait for it; if nobody goes on with it, remove what lies there, "
+            f"{CLAIM} last, and upload again",
+        )
+    # Looked at when nobody else writes any more: before, another upload could have ended since.
+    if store.size(DATASET) is not None:
+        there = store.read(MANIFEST)
+        store.delete(CLAIM)
+        if there is None or there.content != manifest:
+            raise _immutable(place)
+        return place
+    lines = [line for line in read_manifest(folder) if line.path != DATASET]
+    _send_all(store, folder, lines, console)
+    store.write(MANIFEST, folder / MANIFEST)
+    store.write(DATASET, folder / DATASET)
+    store.delete(CLAIM)
+    return place
+
+
+def _send_all(
+    store: RemoteStore, folder: Path, lines: list[ManifestLine], console: Console
+) -> None:
+    columns = (TextColumn("upload"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with Progress(*columns, console=console, disable=console.quiet) as progress:
+        task = progress.add_task("upload", total=sum(line.size for line in lines))
+
+        def send(line: ManifestLine) -> None:
+            if store.size(line.path) != line.size:  # an object is there as a whole or not at all
+                store.write(line.path, folder / line.path)
+            progress.advance(task, line.size)
+
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            futures = [pool.submit(send, line) for line in lines]
+            try:
+                for future in futures:
+                    future.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+
+def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: bool) -> RemotePath:
+    hub, repo = client(), place.repository.removeprefix("hf://")
+    api, kind, tag = hub.HfApi(), "dataset", f"v{dataset.info.version}"
+
+    def asked(do: Callable[[], Any]) -> Any:
+        try:
+            return do()
+        except (OSError, ValueError) as error:  # the client's errors are such
+            raise hub_error(error, str(place)) from error
+
+    asked(lambda: api.create_repo(repo, repo_type=kind, private=private, exist_ok=True))
+    before = pinned(RemotePath.parse(place.repository))
+    there = store_at(before.root).read(MANIFEST)
+    tags = [t.name for t in asked(lambda: api.list_repo_refs(repo, repo_type=kind)).tags]
+    if there is None or there.content != (folder / MANIFEST).read_bytes():
+        if tag in tags:
+            raise _immutable(RemotePath.parse(place.repository, tag))
+        asked(
+            lambda: api.upload_folder(
+                repo_id=repo,
+                repo_type=kind,
+                folder_path=folder,
+                allow_patterns=[*(line.path for line in read_manifest(folder)), MANIFEST],
+                delete_patterns=["runs/*", "tables/*"],  # of an earlier version
+                commit_message=f"{dataset.info.id}, version {dataset.info.version}",
+                parent_commit=before.commit,  # refused if another publisher was quicker
+            )
+        )
+    now = pinned(RemotePath.parse(place.repository))
+    if tag not in tags:
+        asked(lambda: api.create_tag(repo, tag=tag, revision=now.commit, repo_type=kind))
+    return now
+
+
+def _immutable(place: RemotePath) -> RegistryError:
+    return RegistryError(
+        "other data of this version are published there, and what is published stays",
+        expected="an address without a data set, or the same data",
+        got="another manifest",
+        where=place,
+        do="publish it under another version, or address",
+    )
+
+
+__all__ = ["CLAIM", "upload"]
