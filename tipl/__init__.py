@@ -20,7 +20,7 @@ from tipl.evaluation import EvaluateConfig, evaluate
 from tipl.forecast import TIPL, Forecaster
 from tipl.representation import TemporalSVD
 from tipl.train import TrainConfig, train
-from tipl.zoo import load
+from tipl.zoo import load, push
 
 __all__ = [
     "TIPL",
@@ -35,6 +35,7 @@ __all__ = [
     "evaluate",
     "fit_ladder",
     "load",
+    "push",
     "save_ladder",
     "train",
 ]

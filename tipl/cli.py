@@ -82,7 +82,9 @@ def _train_causal(config: CausalTrainConfig) -> None:
 
 @app.command(name="fit")
 def _fit(
-    data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a data set: path or id")],
+    data: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="a data set: path, id or address")
+    ],
     out: Annotated[Path, tyro.conf.arg(help="a folder; each baseline gets its own in it")],
     seed: Annotated[int, tyro.conf.arg(help="of samples and of the small networks")] = 0,
     horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="snapshots ahead")] = HORIZONS,
@@ -138,7 +140,7 @@ def _check(
     model: Annotated[
         tyro.conf.Positional[str], tyro.conf.arg(help="a folder, a model of the zoo, or a baseline")
     ],
-    data: Annotated[Path, tyro.conf.arg(help="a data set; its first test run is used")],
+    data: Annotated[str, tyro.conf.arg(help="a data set; its first test run is used")],
     out: Annotated[Path, tyro.conf.arg(help="a JSON file")],
     horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="snapshots ahead")] = (1, 2, 5, 10),
     null_batches: Annotated[int, tyro.conf.arg(help="of a training on random walks")] = 2_000,
@@ -199,6 +201,25 @@ def _card(
 ) -> None:
     """Write the card of a model, or the figures of its metrics.json into the card that is there."""
     print(f"card in {write_card(name, out)}")
+
+
+@app.command(name="push")
+def _push(
+    model: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, or a model of the zoo")
+    ],
+    address: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="hf://organisation/name, or s3://bucket/name")
+    ],
+    private: Annotated[
+        bool, tyro.conf.arg(help="of a new repository: only its organisation sees it")
+    ] = False,
+    card: Annotated[
+        Path | None, tyro.conf.arg(help="its card; one of the zoo brings its own")
+    ] = None,
+) -> None:
+    """Publish a model with its card, on the Hugging Face hub or in an object store."""
+    print(f"published: {tipl.push(model, address, private=private, card=card)}")
 
 
 @app.command(name="report")

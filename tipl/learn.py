@@ -58,7 +58,7 @@ class Examples(Protocol):
 class LearnConfig:
     """One training."""
 
-    data: tuple[Path, ...]
+    data: tuple[str | Path, ...]
     """Data sets: paths or ids. The training split of each is learnt from, in equal shares; the
     runs of its validation split choose when to stop."""
     out: Path

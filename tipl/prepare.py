@@ -31,7 +31,7 @@ class Prepared:
     """What the training runs hold, by id."""
 
 
-def prepare(data: Path, *, rank: int, window: int) -> Prepared:
+def prepare(data: str | Path, *, rank: int, window: int) -> Prepared:
     """Read the runs of a data set and fit a basis to each, as the paper does: to the whole run.
 
     The bases of validation runs are fitted in the same way. The paper has no validation runs; they
@@ -84,7 +84,7 @@ def _cut(run: TokenRun, longest: int) -> TokenRun:
     return replace(run, coefficients=run.coefficients[:longest])
 
 
-def _check_alike(runs: Sequence[wt.Run], data: Path) -> None:
+def _check_alike(runs: Sequence[wt.Run], data: str | Path) -> None:
     """One network needs weights that mean the same, the same distance apart."""
     first = runs[0]
     for run in runs:

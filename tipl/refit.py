@@ -53,7 +53,7 @@ def refit_of(forecaster: Forecaster, config: RefitConfig) -> Fit | None:
 
 def check_model(
     forecaster: Forecaster,
-    data: Path,
+    data: str | Path,
     *,
     horizons: tuple[int, ...] = (1, 2, 5, 10),
     batches: int = 2_000,

@@ -36,7 +36,7 @@ class TrainConfig(StepConfig):
     the seed, and when to save.
     """
 
-    data: Path
+    data: str | Path
     """Data set; its training split is used."""
     out: Path
     """Folder of the model. A training that stopped goes on where it was saved last."""

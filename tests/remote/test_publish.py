@@ -71,7 +71,7 @@ def test_what_is_published_stays(bucket: Bucket, published: Path, large: Path) -
 
 def test_another_upload_is_not_disturbed(bucket: Bucket, published: Path, large: Path) -> None:
     store_at(bucket.address).write(CLAIM, (large / "MANIFEST.sha256").read_bytes())
-    with pytest.raises(RegistryError, match=r"(?s)other data are being uploaded.*UPLOADING"):
+    with pytest.raises(RegistryError, match=r"(?s)something else is being uploaded.*UPLOADING"):
         wt.upload(published, bucket.address)
     assert list(objects_of(bucket)) == [CLAIM]
     wt.upload(large, bucket.address)  # whose claim it is

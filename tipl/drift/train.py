@@ -37,7 +37,7 @@ class DriftConfig:
 
     gate: Path
     """Folder of a trained tipl-gate."""
-    data: Path
+    data: str | Path
     """Data set: a path or an id. Its validation runs, which need returns, choose."""
     out: Path
     """Folder of the model. What was measured before an interruption is kept there."""

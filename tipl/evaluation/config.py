@@ -14,7 +14,7 @@ HORIZONS = (*range(1, 11), 20, 50, 100, 200)
 class EvaluateConfig:
     """One evaluation."""
 
-    data: Path
+    data: str | Path
     """Data set: a path or an id."""
     out: Path
     """Folder of the results. What was measured before an interruption is kept there."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from tipl import baselines
 from tipl.causal import Causal
@@ -29,16 +31,32 @@ def names() -> list[str]:
     return sorted(file.parent.name for file in MODELS.glob("*/config.json"))
 
 
-def load(name: str | Path) -> Forecaster:
+def load(name: str | Path, *, revision: str | None = None) -> Forecaster:
     """A forecaster: from the folder that it was saved in, or a released one by its name.
 
     Looked for in this order: a folder, a model of the zoo, a baseline that needs no fit. A released
-    model is part of the package: nothing is downloaded.
+    model is part of the package: nothing is downloaded. One at an address, ``hf://org/name`` or
+    ``s3://bucket/name``, is downloaded the first time.
+
+    Args:
+        name: folder, name or address.
+        revision: branch, tag or commit, of a model on the hub.
 
     Raises:
         ForecastError: there is no such folder, and no forecaster of this name.
         ModelError: the folder holds something else.
+        FileNotFoundError: there is no model at the address.
+        RemoteError: it cannot be had from its address.
     """
+    if "://" in str(name):
+        from tipl.zoo.remote import fetch
+
+        folder, called = fetch(str(name), revision)
+        forecaster: Any = KINDS[kind_of(folder)].load(folder)
+        named: Forecaster = (
+            replace(forecaster, name=called) if _has_a_name(forecaster) else forecaster
+        )
+        return named
     path = Path(name)
     if not (path / "config.json").is_file() and str(name) in names():
         path = MODELS / path
@@ -53,6 +71,11 @@ def load(name: str | Path) -> Forecaster:
         got=str(name),
         do="name the folder that `tipl train` or `tipl fit` made, or see `tipl zoo`",
     )
+
+
+def _has_a_name(forecaster: Any) -> bool:
+    """Whether it is named after its folder, as all are but for those that there is one of."""
+    return any(field.name == "name" for field in fields(forecaster))
 
 
 def kind_of(folder: Path) -> str:

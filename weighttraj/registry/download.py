@@ -124,6 +124,32 @@ def download(
     return open_dataset(target)
 
 
+def download_folder(place: RemotePath, target: Path, console: Console | None = None) -> None:
+    """Download the files that a manifest at an address lists, and check them.
+
+    Args:
+        place: where ``upload_folder`` wrote them.
+        target: folder to be made.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        FileNotFoundError: there is no manifest at the address.
+        StoreLockedError: another process is downloading it.
+        DamageError: a file there is not what the manifest says.
+        RemoteError: it cannot be reached; what came is kept.
+    """
+    store = store_at(place.root)
+    manifest = store.read(MANIFEST)
+    if manifest is None:
+        raise FileNotFoundError(f"nothing is published at {place}: it has no {MANIFEST}")
+    lines = parse_manifest(manifest.content, place)
+    draft = target.with_name(f".{target.name}.download")
+    with _kept(draft):
+        _fetch_all(store, place, lines, draft, console or Console(quiet=True))
+        replace_file(draft / MANIFEST, manifest.content)
+        draft.rename(target)
+
+
 def home() -> Path:
     """Where data sets are put that are downloaded."""
     return folders()[0]
@@ -325,4 +351,4 @@ def _sha256(file: Path) -> Any:
         return hashlib.file_digest(content, "sha256")
 
 
-__all__ = ["SOURCE", "Source", "download", "home", "name_of", "source_of"]
+__all__ = ["SOURCE", "Source", "download", "download_folder", "home", "name_of", "source_of"]

@@ -71,9 +71,8 @@ def upload(
             got=address,
             do="copy the data set's folder to where the server finds it",
         )
-    if place.scheme == "file":
-        Path(place.root.removeprefix("file://")).mkdir(parents=True, exist_ok=True)
-    return _upload_objects(folder, place, console)
+    upload_folder(folder, place, last=DATASET, console=console)
+    return place
 
 
 def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
@@ -110,32 +109,48 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
         )
 
 
-def _upload_objects(folder: Path, place: RemotePath, console: Console) -> RemotePath:
-    """Write objects one by one; a claim says whose they are until the last one is written."""
+def upload_folder(
+    folder: Path, place: RemotePath, *, last: str = MANIFEST, console: Console | None = None
+) -> None:
+    """Write the files that a folder's manifest lists as objects, then the manifest.
+
+    A claim says whose they are until the last one is written.
+
+    Args:
+        folder: it has a manifest, ``weighttraj.format.catalog.write_manifest``.
+        place: address; ``file://`` folders are made.
+        last: the file that readers begin with, written last.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        RegistryError: other files are there, or are being uploaded there.
+        RemoteError: the address cannot be reached.
+    """
+    if place.scheme == "file":
+        Path(place.root.removeprefix("file://")).mkdir(parents=True, exist_ok=True)
     store, manifest = store_at(place.root), (folder / MANIFEST).read_bytes()
     claimed = store.write(CLAIM, manifest, new=True)
     if not claimed and (there := store.read(CLAIM)) is not None and there.content != manifest:
         raise RegistryError(
-            "other data are being uploaded to this address, or were, when it was stopped",
-            expected="nothing, or the same data set",
+            "something else is being uploaded to this address, or was, when it was stopped",
+            expected="nothing, or the same files",
             got=CLAIM,
             where=place,
             do="wait for it; if nobody goes on with it, remove what lies there, "
             f"{CLAIM} last, and upload again",
         )
     # Looked at when nobody else writes any more: before, another upload could have ended since.
-    if store.size(DATASET) is not None:
+    if store.size(last) is not None:
         there = store.read(MANIFEST)
         store.delete(CLAIM)
         if there is None or there.content != manifest:
             raise _immutable(place)
-        return place
-    lines = [line for line in read_manifest(folder) if line.path != DATASET]
-    _send_all(store, folder, lines, console)
-    store.write(MANIFEST, folder / MANIFEST)
-    store.write(DATASET, folder / DATASET)
+        return
+    lines = [line for line in read_manifest(folder) if line.path != last]
+    _send_all(store, folder, lines, console or Console(quiet=True))
+    for name in dict.fromkeys((MANIFEST, last)):
+        store.write(name, folder / name)
     store.delete(CLAIM)
-    return place
 
 
 def _send_all(
@@ -167,7 +182,7 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
     def asked(do: Callable[[], Any]) -> Any:
         try:
             return do()
-        except (OSError, ValueError) as error:  # the client's errors are such
+        except (OSError, ValueError, RuntimeError) as error:  # the client's errors are such
             raise hub_error(error, str(place)) from error
 
     asked(lambda: api.create_repo(repo, repo_type=kind, private=private, exist_ok=True))
@@ -177,13 +192,17 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
     if there is None or there.content != (folder / MANIFEST).read_bytes():
         if tag in tags:
             raise _immutable(RemotePath.parse(place.repository, tag))
+        # One commit: the client's upload_folder makes several of many files, and readers see them.
+        lines = [line.path for line in read_manifest(folder)]
+        names = {*lines, MANIFEST}
+        old = asked(lambda: api.list_repo_files(repo, repo_type=kind, revision=before.commit))
+        adds = [hub.CommitOperationAdd(name, folder / name) for name in sorted(names)]
+        gone = [n for n in old if n.startswith(("runs/", "tables/")) and n not in names]
         asked(
-            lambda: api.upload_folder(
-                repo_id=repo,
+            lambda: api.create_commit(
+                repo,
+                [*adds, *(hub.CommitOperationDelete(name) for name in gone)],
                 repo_type=kind,
-                folder_path=folder,
-                allow_patterns=[*(line.path for line in read_manifest(folder)), MANIFEST],
-                delete_patterns=["runs/*", "tables/*"],  # of an earlier version
                 commit_message=f"{dataset.info.id}, version {dataset.info.version}",
                 parent_commit=before.commit,  # refused if another publisher was quicker
             )
@@ -196,12 +215,12 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
 
 def _immutable(place: RemotePath) -> RegistryError:
     return RegistryError(
-        "other data of this version are published there, and what is published stays",
-        expected="an address without a data set, or the same data",
+        "something else is published there, and what is published stays",
+        expected="an address where nothing is, or the same files",
         got="another manifest",
         where=place,
         do="publish it under another version, or address",
     )
 
 
-__all__ = ["CLAIM", "upload"]
+__all__ = ["CLAIM", "upload", "upload_folder"]

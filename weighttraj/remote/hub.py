@@ -16,6 +16,8 @@ def client() -> Any:
     """
     try:
         import huggingface_hub
+        import huggingface_hub.constants
+        import huggingface_hub.errors  # it loads its modules when they are named
     except ModuleNotFoundError as error:
         raise missing_extra("huggingface_hub", "hub") from error
     return huggingface_hub

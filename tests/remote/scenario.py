@@ -1,0 +1,46 @@
+"""Publish a data set and a model; in another process load both by name, train, and evaluate.
+
+Run by ``test_everywhere.py``: ``python -m tests.remote.scenario publish|use DATA MODEL ...``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import tipl
+import weighttraj as wt
+
+MODEL = "tipl-gate-inverted-pendulum-v4"
+
+
+def publish(data: str, model: str, folder: str) -> None:
+    wt.upload(folder, data)
+    tipl.push(MODEL, model)
+
+
+def use(data: str, model: str, out: str) -> None:
+    dataset = wt.load_dataset(data, download=True)
+    train = tipl.TrainConfig(
+        data=dataset.path, out=Path(out) / "tipl", rank=8, n_batches=3, batch_size=8, seed=0
+    )
+    tipl.train(train)
+    config = tipl.EvaluateConfig(
+        data=data if data.startswith("file") else str(dataset.path),
+        out=Path(out) / "results",
+        starts=3,
+        function_starts=1,
+        learning_starts=1,
+        plateau_starts=0,
+        episodes=2,
+        horizons=(1, 5),
+        return_horizons=(1,),
+    )
+    forecasters = [tipl.load(model), tipl.load(Path(out) / "tipl")]
+    results = tipl.evaluate(forecasters, config)
+    print(json.dumps({"runs": len(dataset), "judged": list(results["forecasters"])}))
+
+
+if __name__ == "__main__":
+    {"publish": publish, "use": use}[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,131 @@
+"""Models that are published at an address, on the Hugging Face hub or in an object store.
+
+One address holds one model: what its folder does, ``config.json`` and ``safetensors``, and a card.
+Nothing in it is code, and nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from tipl.errors import ForecastError
+from tipl.forecast import Forecaster
+from tipl.zoo import lookup
+from tipl.zoo.card import write_card
+from weighttraj.format.catalog import write_manifest
+from weighttraj.registry.download import download_folder
+from weighttraj.registry.upload import upload_folder
+from weighttraj.remote import RemotePath, hub
+
+FILES = ("*.json", "*.safetensors", "README.md")
+"""What is downloaded of a repository on the hub, whatever lies in it."""
+VARIABLE = "WEIGHTTRAJ_MODELS_PATH"
+"""Environment variable: folder for models from object stores. Default: ~/.weighttraj/models."""
+
+
+def fetch(address: str, revision: str | None = None) -> tuple[Path, str]:
+    """The folder of a model at an address, and its name.
+
+    It is downloaded once, and found without a network from then on.
+
+    Raises:
+        FileNotFoundError: there is no model at the address.
+        RegistryError: it is no address.
+        RemoteError: it cannot be reached.
+    """
+    place = RemotePath.parse(address, revision)
+    if place.scheme != "hf":
+        home = Path(os.environ.get(VARIABLE, "~/.weighttraj/models")).expanduser()
+        folder = home / hashlib.sha256(place.root.encode()).hexdigest()[:16] / place.name
+        if not folder.is_dir():  # it appears when it is whole, and what is published stays
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            download_folder(place, folder)
+        return folder, place.name
+    repo, _, at = place.root.removeprefix("hf://").partition("@")
+    try:
+        found = hub.client().snapshot_download(repo, revision=at, allow_patterns=[*FILES])
+    except (OSError, ValueError, RuntimeError) as error:  # the client's errors are such
+        raise hub.hub_error(error, address) from error
+    return Path(found), place.name
+
+
+def push(
+    model: Forecaster | str | Path,
+    address: str,
+    *,
+    private: bool = False,
+    card: Path | None = None,
+) -> str:
+    """Publish a model, whole or not at all.
+
+    Args:
+        model: a forecaster, the folder of a saved one, or a released one by its name, which brings
+            its card.
+        address: ``hf://org/name``, or a place of its own in an object store: ``s3://bucket/name``.
+        private: of a new repository on the hub: only its organisation sees it.
+        card: its card, Markdown; None: that of a released model, else the one in the folder.
+
+    Returns:
+        The address; on the hub with the commit that it is now.
+
+    Raises:
+        ForecastError: there is no such forecaster, or it has no card.
+        RegistryError: it is no address, or another model is published there.
+        RemoteError: it cannot be reached, or refuses.
+    """
+    place = RemotePath.parse(address)
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder) / "model"
+        _write(model, written, card)
+        if place.scheme == "hf":
+            return _push_to_hub(written, place, private)
+        write_manifest(written)
+        upload_folder(written, place)
+        return str(place)
+
+
+def _push_to_hub(folder: Path, place: RemotePath, private: bool) -> str:
+    client, repo = hub.client(), place.repository.removeprefix("hf://")
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    try:
+        api = client.HfApi()
+        api.create_repo(repo, private=private, exist_ok=True)
+        adds = [
+            client.CommitOperationAdd(file.relative_to(folder).as_posix(), file) for file in files
+        ]
+        info = api.create_commit(repo, adds, commit_message=place.name)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise hub.hub_error(error, str(place)) from error
+    return f"{place.repository}@{info.oid}"
+
+
+def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None:
+    """The files of a model and its card, as they are published."""
+    name = str(model) if isinstance(model, str | Path) else ""
+    released = name in lookup.names()
+    if isinstance(model, str | Path):
+        lookup.load(model)  # raises if it is none
+        shutil.copytree(lookup.MODELS / name if released else name, out)
+    else:
+        model.save(out)
+    if card is None and released:
+        card = Path(__file__).parents[2] / "cards/models" / f"{name}.md"
+        if not card.is_file():  # only a clone has those with prose by hand
+            card = write_card(name, out.with_name("cards"))
+    if card is not None:
+        shutil.copyfile(card, out / "README.md")
+    if not (out / "README.md").is_file():
+        raise ForecastError(
+            "a model is published with a card that says what it is",
+            expected="--card FILE, or README.md beside the model",
+            got="none",
+            where=model if isinstance(model, str | Path) else type(model).__name__,
+            do="write one: what it forecasts, what it learnt from, its figures, its limits",
+        )
+
+
+__all__ = ["FILES", "VARIABLE", "fetch", "push"]
