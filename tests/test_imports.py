@@ -203,6 +203,20 @@ ALLOWED = {
         "weighttraj.format.packing",
         "weighttraj.format.storage",
     ],
+    "weighttraj.registry.croissant": [
+        "weighttraj.errors",
+        "door weighttraj.format",
+        "weighttraj.format.tables",
+    ],
+    "weighttraj.registry.card": [
+        "weighttraj.errors",
+        "door weighttraj.format",
+        "weighttraj.format.catalog",
+        "weighttraj.format.locate",
+        "weighttraj.format.objects",
+        "weighttraj.format.tables",
+        "weighttraj.registry.croissant",
+    ],
     "weighttraj.registry.download": [
         "weighttraj.errors",
         "door weighttraj.format",

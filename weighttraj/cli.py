@@ -239,6 +239,14 @@ def _download(args: _Download) -> None:
     print(f"{len(dataset)} runs in {dataset.path}")
 
 
+@app.command(name="card")
+def _card(
+    path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set: path or id")],
+) -> None:
+    """Write the card of a data set, or the facts into the one that is there; and croissant.json."""
+    print(f"card in {registry.write_card(path)}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Upload:
     path: tyro.conf.Positional[str]

@@ -1,10 +1,11 @@
 """Data sets by their ids: which are here, what they hold, new ones, and those elsewhere.
 
 ``local`` finds and deletes, ``search`` asks all runs of all data sets, ``derive`` makes a data set
-of runs, or of others; ``upload`` publishes one, ``download`` brings one here, and ``load`` opens it
-by its name, wherever it is.
+of runs, or of others; ``card`` says what one is, ``upload`` publishes it, ``download`` brings one
+here, and ``load`` opens it by its name, wherever it is.
 """
 
+from weighttraj.registry.card import write_card
 from weighttraj.registry.derive import combine, create, split
 from weighttraj.registry.download import download
 from weighttraj.registry.load import load_dataset
@@ -23,4 +24,5 @@ __all__ = [
     "search",
     "split",
     "upload",
+    "write_card",
 ]
