@@ -11,7 +11,6 @@ import pytest
 
 import weighttraj as wt
 
-GUIDES = ["bring-your-own"]
 DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
 
@@ -26,15 +25,27 @@ def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPa
     assert study.insert(stale) == page != stale
 
 
-@pytest.mark.parametrize("name", GUIDES)
-def test_every_block_of_a_guide_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def run_blocks(name: str, change: tuple[str, str] = ("", "")) -> dict[str, Any]:
+    """Run the Python of a guide; returns its names."""
     names: dict[str, Any] = {}
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / f"{name}.md").read_text(), re.DOTALL)
     for block in blocks:
-        exec(compile(block, f"{name}.md", "exec"), names)  # noqa: S102
+        exec(compile(block.replace(*change), f"{name}.md", "exec"), names)  # noqa: S102
+    return names
+
+
+def test_publish_and_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_blocks("publish", ("/tmp/weighttraj-published", f"{tmp_path}/published"))  # noqa: S108
+    assert names["window"].shape == (20, 122)
+    assert len(names["copy"]) == 50
+    assert [len(run) for run in names["part"]] == [241, 241]
+    assert wt.verify(tmp_path / "published/inverted-pendulum-v4-ppo-v1") == []
+
+
+def test_bring_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_blocks("bring-your-own")
     for path in tmp_path.glob("data/mine/*.zarr"):
         assert wt.verify(path) == []
     made = wt.open("data/mine/all")
