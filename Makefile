@@ -36,6 +36,7 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_format.py data/bench/*/runs/*.zarr.zip --save
 	WEIGHTTRAJ_CACHE=data/bench/cache $(BIN)/python -W ignore tests/benchmarks/bench_load.py data/bench/*/runs/*.zarr.zip --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_svd.py --real data/bench/half-cheetah/runs/seed0000.zarr.zip --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_remote.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_callback.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_returns.py data/bench/inverted-pendulum data/bench/half-cheetah --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --save

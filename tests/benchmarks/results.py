@@ -28,6 +28,7 @@ def render(results: dict[str, Any]) -> str:
     """All sections: tables, and a line for each other figure."""
     sections = {
         "Storing and loading": [*_format(results["format"]), *_bullets(_stored(results))],
+        "Reading from elsewhere": _bullets(_remote(results)),
         "Collecting and returns": _bullets(_collected(results)),
         "Does a population learn as SB3 does?": _section(_learning, results.get("learning")),
         "Temporal SVD and training": _bullets(_trained(results)),
@@ -69,6 +70,25 @@ def _format(measured: dict[str, Any]) -> list[str]:
         "in CPU time, digests checked.",
         "",
     ]
+
+
+def _remote(results: dict[str, Any]) -> Iterator[str]:
+    if (row := results.get("remote")) is None:
+        return
+    yield (
+        f"A data set of {row['runs']} runs opened at an address and one window read: "
+        f"{row['requests']} requests; over S3 on loopback "
+        f"{row['open_and_window_s'] * 1000:.0f} ms (median of {row['turns']})."
+    )
+    yield (
+        f"The window takes {row['bytes_of_the_window'] / 1e3:,.0f} kB, "
+        f"{row['bytes_of_the_window'] / row['bytes_of_its_chunks']:.2f} times its chunks; opening, "
+        f"once, {row['bytes_before_the_window'] / 1e3:,.0f} kB."
+    )
+    yield (
+        f"All of it downloaded and checked takes {row['download_ratio']:.2f} times as long as "
+        f"boto3's `download_file` with as many threads, which checks nothing."
+    )
 
 
 def _stored(results: dict[str, Any]) -> Iterator[str]:
