@@ -250,6 +250,7 @@ ALLOWED = {
         "weighttraj.remote",
         "later weighttraj.collect.recipe",
         "later weighttraj.load",
+        "later weighttraj.publish.gallery",
         "later weighttraj.publish.report",
     ],
     "weighttraj": [FORMAT, "weighttraj.remote"],

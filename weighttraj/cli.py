@@ -18,7 +18,7 @@ from rich.table import Table
 import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import WeightTrajError
-from weighttraj.format.locate import locate
+from weighttraj.format.locate import clone, locate
 from weighttraj.remote import is_remote
 
 app = tyro.extras.SubcommandApp()
@@ -353,10 +353,15 @@ def _pack(args: _Pack) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    path: tyro.conf.Positional[Path]
+    path: tyro.conf.Positional[Path | None] = None
     """Data set (path or id) or run."""
-    out: Path = Path("report.html")
-    """Page to be written: one file that opens from disk. An earlier report is replaced."""
+    all: bool = False
+    """A gallery: pages of all data sets that `list` shows, of models by their cards, an index."""
+    cards: Path | None = None
+    """With --all: folder of the cards of models. Default: cards/models of the clone."""
+    out: Path | None = None
+    """Page to be written, which opens from disk; with --all a folder. An earlier report is
+    replaced. Default: report.html, or gallery."""
     film: bool = True
     """A short film of a policy at five moments of its training."""
     seed: int = 0
@@ -369,18 +374,35 @@ class _Report:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _report(args: _Report) -> None:
     """Write a page that shows what a data set or a run holds: returns, steps, spectrum, film."""
+    if args.all:
+        _gallery(args)
+        return
+    if args.path is None:
+        console.print("[red]error:[/red] name a data set, or give --all for all that are here")
+        raise SystemExit(2)
     from weighttraj.publish.report import report
 
     print(
         report(
             locate(args.path),
-            args.out,
+            args.out or Path("report.html"),
             film=args.film,
             seed=args.seed,
             overwrite=args.overwrite,
             console=console,
         )
     )
+
+
+def _gallery(args: _Report) -> None:
+    from weighttraj.publish.gallery import gallery
+
+    own = clone()
+    cards = args.cards or (own.parent / "cards/models" if own else Path("none"))
+    datasets = {dataset.id: dataset.path for dataset in registry.local_datasets()}
+    out = args.out or Path("gallery")
+    models = sorted(cards.glob("*.md"))
+    print(gallery(datasets, out, cards=models, film=args.film, console=console))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -128,7 +128,7 @@ def test_a_refit_is_of_the_same_kind_and_sizes(
     assert fit is not None
     found = fit(walks)
     assert isinstance(found, TIPL)
-    assert found.config == replace(old.config, gpt=replace(gpt, max_timestep=299))
+    assert found.config == replace(old.config, gpt=replace(gpt, max_timestep=299), parameters=122)
     trained = [run.weights[:] for run in wt.open(tmp_path / "walks").split("train")]
     assert all(np.array_equal(a, b.weights[:]) for a, b in zip(trained, walks, strict=True))
     assert np.isfinite(skills(found, walks[:1], [1])).all()

@@ -80,17 +80,17 @@ def report(
         DamageError: the data are damaged.
     """
     out = Path(out)
-    _refuse_foreign(out, overwrite)
+    refuse_foreign(out, overwrite)
     source = open_source(path)
     with _progress(console) as progress:
         page = _page(source, film=film, seed=seed, progress=progress)
-    _refuse_foreign(out, overwrite)  # it took a while
+    refuse_foreign(out, overwrite)  # it took a while
     out.parent.mkdir(parents=True, exist_ok=True)
     replace_file(out, page.encode())
     return out
 
 
-def _refuse_foreign(out: Path, overwrite: bool) -> None:
+def refuse_foreign(out: Path, overwrite: bool) -> None:
     """Only pages of ours are replaced.
 
     Raises:

@@ -1,0 +1,142 @@
+"""The gallery: an index that can be searched, a page for each data set and card, from disk."""
+
+from __future__ import annotations
+
+import html
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from weighttraj import cli
+from weighttraj.errors import StoreExistsError
+from weighttraj.publish.gallery import as_html, gallery
+from weighttraj.registry import LocalDataset, write_card
+
+CARD = """---
+datasets:
+- small
+---
+
+# a-model
+
+<!-- facts -->
+It **forecasts** [weights](../../docs/results.md), see [the paper](https://arxiv.org/abs/2503.04074).
+
+| a | b |
+|---|---|
+| 1 | <script>alert(1)</script> |
+
+![picture](a-model.svg) ![far](../secret.svg)
+"""
+
+
+@pytest.fixture
+def place(small_dataset: Path, tmp_path: Path) -> Path:
+    shutil.copytree(small_dataset, tmp_path / "small")
+    write_card(tmp_path / "small")
+    (tmp_path / "cards").mkdir()
+    (tmp_path / "cards/a-model.md").write_text(CARD)
+    (tmp_path / "cards/a-model.svg").write_text("<svg/>")
+    (tmp_path / "secret.svg").write_text("<svg/>")
+    return tmp_path
+
+
+def make(place: Path) -> Path:
+    datasets = {"small": place / "small", "team/small": place / "small"}
+    return gallery(datasets, place / "out", cards=[place / "cards/a-model.md"], film=False)
+
+
+def test_every_link_leads_to_a_page(place: Path) -> None:
+    index = make(place)
+    pages = sorted(page.relative_to(place / "out").as_posix() for page in index.parent.rglob("*"))
+    assert pages == [
+        *("cards", "cards/a-model.html", "cards/a-model.svg", "cards/small.html"),
+        *("cards/team__small.html", "data", "data/small.html", "data/team__small.html"),
+        "index.html",
+    ]
+    for page in index.parent.rglob("*.html"):
+        for link in re.findall(r'(?:href|src)="([^"#]+)"', page.read_text()):
+            if not link.startswith(("https:", "data:")):
+                assert (page.parent / link).is_file() or link == "../secret.svg", link
+
+
+def test_the_index_says_what_there_is(place: Path) -> None:
+    text = html.unescape(make(place).read_text())
+    assert "4 (2 train, 2 test)" in text
+    assert "It forecasts weights, see the paper." in text
+    assert text.count("<svg") == 2  # learning curves
+    assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text).replace("http-equiv", "")
+
+
+def test_cards_are_text_not_code(place: Path) -> None:
+    make(place)
+    text = (place / "out/cards/a-model.html").read_text()
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert "facts -->" not in text
+    assert "docs/results.md" not in text  # it leads nowhere from here
+    assert 'href="https://arxiv.org/abs/2503.04074"' in text
+
+
+def test_markdown() -> None:
+    page, pictures = as_html("[a](b.md) [c](https://d) ![e](f.svg)")
+    assert page == '<p>a <a href="https://d">c</a> <img src="f.svg" alt="e" /></p>\n'
+    assert pictures == ["f.svg"]
+
+
+def test_it_is_written_again_but_nothing_else_is_replaced(place: Path) -> None:
+    index = make(place)
+    before = index.read_bytes()
+    assert make(place).read_bytes() == before
+    index.write_text("mine")
+    with pytest.raises(StoreExistsError):
+        make(place)
+    assert index.read_text() == "mine"
+
+
+def test_what_is_damaged_is_left_out(place: Path) -> None:
+    (place / "small/dataset.json").write_text("{}")
+    assert "Data sets</h2>" not in make(place).read_text()
+
+
+def test_the_search_in_a_browser(place: Path, tmp_path: Path) -> None:
+    browser = shutil.which("chromium")
+    if browser is None:
+        pytest.skip("Chromium is not installed")
+    index = make(place)
+    quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
+    command = [
+        *(browser, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic"),
+        *(*quiet, "--no-first-run", f"--user-data-dir={tmp_path / 'browser'}", "--dump-dom"),
+    ]
+
+    def shown(query: str) -> list[str]:
+        done = subprocess.run(
+            [*command, f"file://{index}#q={query}"], capture_output=True, text=True, check=True
+        )
+        entries = re.findall(r"<li data-words=[^>]*?(hidden=\"\")?>\s*<h3>(.*?)</h3>", done.stdout)
+        assert len(entries) == 3
+        return [name for hidden, name in entries if not hidden]
+
+    assert shown("") == ["small", "team/small", "a-model"]
+    assert shown("team%20PPO") == ["team/small"]
+    assert shown("forecasts") == ["a-model"]
+    assert shown("nothing") == []
+
+
+def test_the_command(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    here = [LocalDataset("small", place / "small")]
+    monkeypatch.setattr(cli.registry, "local_datasets", lambda: here)  # not the large ones
+    out = place / "made"
+    cli._report(cli._Report(all=True, film=False, out=out, cards=place / "cards"))
+    assert capsys.readouterr().out.endswith("index.html\n")
+    assert (out / "data/small.html").is_file()
+    assert (out / "cards/a-model.html").is_file()
+    with pytest.raises(SystemExit):
+        cli._report(cli._Report())
+    assert "--all" in capsys.readouterr().out
