@@ -31,11 +31,9 @@ def use(data: str, model: str, out: str) -> None:
         out=Path(out) / "results",
         starts=3,
         function_starts=1,
-        learning_starts=1,
-        plateau_starts=0,
-        episodes=2,
+        learning_starts=0,
         horizons=(1, 5),
-        return_horizons=(1,),
+        bootstrap=20,
     )
     forecasters = [tipl.load(model), tipl.load(Path(out) / "tipl")]
     results = tipl.evaluate(forecasters, config)

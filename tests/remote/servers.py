@@ -251,6 +251,8 @@ def seaweedfs(work: Path) -> Iterator[str]:
             f"-s3.config={config}",
             "-volume.max=500",
             "-master.volumeSizeLimitMB=64",
+            "-s3.port.iceberg=0",  # on ports of their own, which another server could have
+            "-s3.port.lance=0",
             "-master.telemetry=false",
         ),
     ]

@@ -23,7 +23,8 @@ def describe_mlp(
     parameter, ``log_std`` (action,).
 
     >>> actor = nn.Sequential(nn.Linear(4, 8), nn.Tanh(), nn.Linear(8, 2))  # doctest: +SKIP
-    >>> layout, policy = describe_mlp(actor, env.observation_space, env.action_space)  # doctest: +SKIP
+    >>> spaces = env.observation_space, env.action_space  # doctest: +SKIP
+    >>> layout, policy = describe_mlp(actor, *spaces)  # doctest: +SKIP
 
     Args:
         actor: linear layers with one kind of activation between them, and nothing after the last.
