@@ -16,7 +16,14 @@ from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evalu
 from tipl.errors import EvaluateError
 from tipl.evaluation import measure
 from tipl.evaluation.parts import Parts, fingerprint
-from tipl.evaluation.starts import Starts, at_boundary, learning_phase, starts_of
+from tipl.evaluation.starts import (
+    Starts,
+    _sample,
+    at_boundary,
+    learning_phase,
+    shares,
+    starts_of,
+)
 from tipl.evaluation.statistics import Bootstrap, interquartile_mean, mean, ratio_of_sums
 from tipl.evaluation.summary import Summary
 from tipl.evaluation.weights import squared_errors
@@ -183,6 +190,22 @@ def test_starts_leave_room_for_every_horizon(data: Path) -> None:
     few = starts_of(unseen(data), replace(config, starts=3, learning_starts=0))
     assert few.weights.tolist() == [0, 14, 28]
     assert not len(few.learning)
+    some = starts_of(unseen(data), replace(config, starts=12, learning_starts=0))
+    assert some.weights.tolist() == [0, 1, 2, 3, 6, 9, 12, 16, 19, 22, 25, 28]
+
+
+def test_few_starts_stand_for_all() -> None:
+    """Each for the moments around it, so that sums over starts are of the same size."""
+    assert shares(np.array([0, 1, 2, 6])).tolist() == [1, 1, 2.5, 2.5]
+    assert shares(np.arange(9)).tolist() == [1] * 9
+    moments = np.arange(1700)
+    error = 1e-3 + np.exp(-moments / 20)  # long steps at the start
+    for count, near in ((60, 0.15), (300, 0.001)):
+        starts = _sample(1699, count)
+        assert len(np.unique(starts)) == count
+        assert shares(starts).sum() == 1700
+        estimate = (shares(starts) * error[starts]).sum()
+        assert estimate == pytest.approx(error.sum(), rel=near)
 
 
 # Statistics

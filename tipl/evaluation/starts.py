@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from tipl.errors import EvaluateError
 from tipl.evaluation.config import EvaluateConfig
@@ -13,6 +13,9 @@ from weighttraj import Run
 
 LEARNED = 0.95
 """Share of the way from the first to the final return at which the learning phase ends."""
+DENSE = 64
+"""First moments of a run that are always among the starts: the longest steps are there, and a sum
+over starts hangs on a few of them."""
 _HISTORY = 10
 """Snapshots that a forecast of returns may look back on, at least."""
 
@@ -46,13 +49,13 @@ def starts_of(run: Run, config: EvaluateConfig) -> Starts:
         )
     none = np.zeros(0, int)
     if not config.learning_starts:
-        return Starts(weights=_spread(0, last, config.starts), learning=none, plateau=none)
+        return Starts(weights=_sample(last, config.starts), learning=none, plateau=none)
     end = len(run) - 1 - max(config.return_horizons)
     learned = min(learning_phase(run), end - 1)
     first = min(_HISTORY, learned // 4)
     inside = np.linspace(first, learned, config.learning_starts + 2)[1:-1]
     return Starts(
-        weights=_spread(0, last, config.starts),
+        weights=_sample(last, config.starts),
         learning=np.unique(inside.round().astype(int)),
         plateau=_spread(learned, end, config.plateau_starts + 1)[1:],
     )
@@ -87,9 +90,24 @@ def at_boundary(run: Run, starts: Int[np.ndarray, " start"]) -> Bool[np.ndarray,
     return np.asarray(iteration[starts + 1] != iteration[starts])
 
 
+def shares(starts: Int[np.ndarray, " start"]) -> Float[np.ndarray, " start"]:
+    """How many moments of a run each start stands for: those that are nearest to it."""
+    middles = (starts[1:] + starts[:-1]) / 2
+    edges = np.concatenate([starts[:1] - 0.5, middles, starts[-1:] + 0.5])
+    return np.asarray(np.diff(edges))
+
+
+def _sample(last: int, count: int) -> Int[np.ndarray, " start"]:
+    """All moments up to the last; if fewer are asked for, the first ones, then evenly spaced."""
+    if count > last:
+        return np.arange(last + 1)
+    dense = min(DENSE, count // 4)
+    return np.concatenate([np.arange(dense), _spread(dense, last, count - dense)])
+
+
 def _spread(first: int, last: int, count: int) -> Int[np.ndarray, " start"]:
     """So many integers, evenly from the first to the last."""
     return np.unique(np.linspace(first, last, min(count, last - first + 1)).round().astype(int))
 
 
-__all__ = ["LEARNED", "Starts", "at_boundary", "learning_phase", "starts_of"]
+__all__ = ["DENSE", "LEARNED", "Starts", "at_boundary", "learning_phase", "shares", "starts_of"]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.measure import Measured
 from tipl.evaluation.returns import MODES
+from tipl.evaluation.starts import shares
 from tipl.evaluation.statistics import (
     Bootstrap,
     Interval,
@@ -30,6 +31,7 @@ NEAR = 10
 
 Errors = Float[np.ndarray, "run start horizon *tensor"]
 Chosen = Bool[np.ndarray, "run start"]
+Shares = Float[np.ndarray, "run start"]
 
 
 class Summary:
@@ -67,12 +69,13 @@ class Summary:
         boundary = np.stack([m.boundary for m in self._measured])
         error = np.stack([m.weights[name]["squared"] for m in self._measured])
         copy = np.stack([m.weights[self._copy]["squared"] for m in self._measured])
+        share = np.stack([shares(m.starts.weights) for m in self._measured])
         return {
             aggregate: {
                 kind: self._rows(
                     self._config.horizons,
                     self._bootstrap.interval(
-                        _SKILLS[aggregate], *_summed(aggregate, error, copy, chosen)
+                        _SKILLS[aggregate], *_summed(aggregate, error, copy, share * chosen)
                     ),
                 )
                 for kind, chosen in _kinds(boundary).items()
@@ -84,17 +87,24 @@ class Summary:
         boundary = np.stack([m.function_boundary for m in self._measured])
         error = np.stack([m.functions[name]["kl"] for m in self._measured])[..., None]
         copy = np.stack([m.functions[self._copy]["kl"] for m in self._measured])[..., None]
+        share = np.stack([shares(m.function_starts) for m in self._measured])
         return {
             kind: self._rows(
                 self._config.horizons,
-                self._bootstrap.interval(_skill, *_summed("ratio_of_sums", error, copy, chosen)),
+                self._bootstrap.interval(
+                    _skill, *_summed("ratio_of_sums", error, copy, share * chosen)
+                ),
             )
             for kind, chosen in _kinds(boundary).items()
         }
 
     def _wpe(self, name: str) -> list[dict[str, Any]]:
         size = self._measured[0].tensors.sum()
-        each = [m.weights[name]["squared"].sum(2).mean(0) / size for m in self._measured]
+        each = [
+            np.average(m.weights[name]["squared"].sum(2), axis=0, weights=shares(m.starts.weights))
+            / size
+            for m in self._measured
+        ]
         return self._rows(self._config.horizons, self._bootstrap.interval(mean, np.stack(each)))
 
     def _repw(self, name: str) -> dict[str, Any]:
@@ -186,13 +196,22 @@ def _kinds(boundary: Chosen) -> dict[str, Chosen]:
     return dict(zip(KINDS, (np.ones_like(boundary), ~boundary, boundary), strict=True))
 
 
-def _summed(aggregate: str, error: Errors, copy: Errors, chosen: Chosen) -> tuple[Any, ...]:
-    """What a skill is computed from: a row for each run, so that runs can be drawn."""
-    weight = chosen[:, :, None, None]
+def _summed(aggregate: str, error: Errors, copy: Errors, share: Shares) -> tuple[Any, ...]:
+    """What a skill is computed from: a row for each run, so that runs can be drawn.
+
+    Args:
+        aggregate: which skill.
+        error: of the forecasts.
+        copy: of the copy.
+        share: how much each start counts; 0: it is left out.
+    """
     if aggregate == "mean_of_ratios":
         ratios = 1 - quotient(error.sum(3), copy.sum(3))
-        return (np.stack([_mean(r[c]) for r, c in zip(ratios, chosen, strict=True)]),)
-    sums = (np.where(weight, each, 0.0).sum(1) for each in (error, copy))
+        known = np.isfinite(ratios)
+        counts = np.where(known, share[:, :, None], 0.0)
+        return (quotient((np.where(known, ratios, 0.0) * counts).sum(1), counts.sum(1)),)
+    weight = share[:, :, None, None]
+    sums = (np.where(weight > 0, weight * each, 0.0).sum(1) for each in (error, copy))
     if aggregate == "ratio_of_sums":
         return tuple(each.sum(2) for each in sums)
     return tuple(sums)
