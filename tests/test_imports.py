@@ -217,8 +217,10 @@ ALLOWED = {
         "weighttraj.format.tables",
         "weighttraj.registry.croissant",
     ],
+    "weighttraj.registry.transfer": ["weighttraj.format.catalog"],
     "weighttraj.registry.download": [
         "weighttraj.errors",
+        "weighttraj.registry.transfer",
         "door weighttraj.format",
         "weighttraj.format.catalog",
         "weighttraj.format.locate",
@@ -236,6 +238,7 @@ ALLOWED = {
     ],
     "weighttraj.registry.upload": [
         "weighttraj.errors",
+        "weighttraj.registry.transfer",
         "weighttraj.format.lint",
         "door weighttraj.format",
         "weighttraj.format.catalog",

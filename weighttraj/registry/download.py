@@ -7,7 +7,6 @@ import hashlib
 import json
 import shutil
 from collections.abc import Collection, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,13 +35,12 @@ from weighttraj.format.locate import folders
 from weighttraj.format.objects import refuse_existing, replace_file
 from weighttraj.format.packing import cut
 from weighttraj.format.storage import PACKED
+from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
 
 SOURCE = ".source.json"
 """File in a downloaded data set that says where it is from; no object of the data set."""
-AT_ONCE = 4
-"""Files that are fetched at the same time."""
 TRIES = 5
 """Times that a file is gone on with after an answer broke off without a byte."""
 
@@ -183,14 +181,7 @@ def _fetch_all(
         def fetch(line: ManifestLine) -> None:
             _fetch(store, (at / line.path).part, line, draft / line.path, progress, task)
 
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            futures = [pool.submit(fetch, line) for line in lines]
-            try:
-                for future in futures:
-                    future.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        for_each(lines, fetch)
 
 
 def _fetch(

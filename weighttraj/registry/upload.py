@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from weighttraj.errors import RegistryError
 from weighttraj.format import Dataset, lint, open_dataset, verify
 from weighttraj.format.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
 from weighttraj.format.locate import locate
+from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.hub import client, hub_error, pinned
 from weighttraj.remote.store import RemoteStore, store_at
@@ -21,8 +21,6 @@ from weighttraj.remote.store import RemoteStore, store_at
 CLAIM = "UPLOADING.sha256"
 """Object that holds the manifest of what is being uploaded, for as long as it is."""
 CARD = "README.md"
-AT_ONCE = 4
-"""Files that are sent at the same time."""
 
 
 def upload(
@@ -165,14 +163,7 @@ def _send_all(
                 store.write(line.path, folder / line.path)
             progress.advance(task, line.size)
 
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            futures = [pool.submit(send, line) for line in lines]
-            try:
-                for future in futures:
-                    future.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        for_each(lines, send)
 
 
 def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: bool) -> RemotePath:
