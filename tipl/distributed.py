@@ -21,6 +21,12 @@ from torch import Tensor
 
 from tipl.errors import TrainError
 
+if dist.is_available():
+    # Its functions take the group that there is when it is imported as a default argument. Torch
+    # imports it with the first optimizer; were that after the start of a group, the threads of the
+    # group would outlive it, and now and then abort the process at its end.
+    import torch.distributed.nn.functional
+
 T = TypeVar("T")
 
 # Ranks wait while rank 0 reads the data and fits bases. One that dies is noticed without it.
