@@ -120,8 +120,8 @@ def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
 def test_it_finds_nothing_in_random_walks(
     trained: Causal, runs: list[wt.Run], tmp_path: Path
 ) -> None:
-    walks = random_walks(runs[0], tmp_path, count=6)
-    fit = refit_of(trained, RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=40))
+    walks = random_walks(runs[0], tmp_path, count=6, length=200)
+    fit = refit_of(trained, RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=20))
     assert fit is not None
     again = fit(walks[2:])
     assert isinstance(again, Causal)

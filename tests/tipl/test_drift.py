@@ -10,8 +10,9 @@ import pytest
 import torch
 
 import weighttraj as wt
+from tipl.baselines import by_name
 from tipl.checks import TOLERANCE, causality, equivariance, random_walks, scale
-from tipl.drift import Drift, DriftConfig, train_drift
+from tipl.drift import Drift, DriftConfig, Further, train_drift
 from tipl.drift.train import gains_of
 from tipl.errors import EvaluateError, ForecastError, ModelError, TrainError
 from tipl.evaluation.returns import Player
@@ -55,7 +56,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def config(data: Path) -> DriftConfig:
     lively().save(data.with_name("gate"))
     return DriftConfig(
-        gate=data.with_name("gate"), data=data, out=data.with_name("model"), horizons=(1, 5),
+        along=data.with_name("gate"), data=data, out=data.with_name("model"), horizons=(1, 5),
         amplitudes=(0.5, 1, 8), starts=3, episodes=5,
     )  # fmt: skip
 
@@ -124,6 +125,43 @@ def test_it_is_fitted_to_walks_with_its_amplitudes(short: wt.Run, tmp_path: Path
     again = fit(random_walks(short, tmp_path, count=4))
     assert isinstance(again, Drift)
     assert again.amplitudes == {1: 4.0, 5: 1.5}
+
+
+# Its rivals
+
+
+def test_any_other_forecast_is_followed_too(run: wt.Run, tmp_path: Path) -> None:
+    slope, starts, horizons = by_name("trend-5"), [9, 30], [1, 5, 25]
+    now = run.weights[starts][:, None].astype(np.float64)
+    rival = Further(slope, {1: 4.0, 25: 2.0})
+    between = 3.0  # 5 lies half-way between 1 and 25 in log h
+    factors = np.array([[4.0], [between], [2.0]]) * np.ones(run.layout.size)
+    factors[:, run.layout["log_std"].slice] = 1
+    expected = factors * (slope.forecast(run, starts, horizons) - now)
+    np.testing.assert_allclose(rival.forecast(run, starts, horizons) - now, expected, atol=1e-6)
+    assert np.abs(expected).max() > 1e-3
+    rival.save(tmp_path / "rival")
+    again = load(tmp_path / "rival")
+    assert (again.name, again.causal) == ("rival", True)
+    assert np.array_equal(
+        again.forecast(run, starts, horizons), rival.forecast(run, starts, horizons)
+    )
+    file = tmp_path / "rival/config.json"
+    file.write_text(file.read_text().replace('"25": 2.0', '"soon": 2.0'))
+    with pytest.raises(ModelError, match="not of horizons"):
+        load(tmp_path / "rival")
+
+
+def test_how_far_a_rival_goes_is_chosen_as_for_the_gate(config: DriftConfig) -> None:
+    name = "trend-5"
+    rival = train_drift(replace(config, along=name, out=config.out.with_name("rival")))
+    assert isinstance(rival, Further)
+    lines = (config.out.with_name("rival") / "log.jsonl").read_text().splitlines()
+    best = max(map(json.loads, lines), key=lambda line: line["gain_5"])
+    assert rival.amplitudes[5] == best["amplitude"]
+    assert load(config.out.with_name("rival")).name == "rival"
+    with pytest.raises(ForecastError, match="no such forecaster"):
+        train_drift(replace(config, along="tomorrow", out=config.out.with_name("none")))
 
 
 # The choice

@@ -166,8 +166,8 @@ def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
 def test_it_finds_nothing_in_random_walks(
     trained: Gate, runs: list[wt.Run], tmp_path: Path
 ) -> None:
-    walks = random_walks(runs[0], tmp_path, count=6)
-    config = RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=60)
+    walks = random_walks(runs[0], tmp_path, count=6, length=200)
+    config = RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=30)
     fit = refit_of(trained, config)
     assert fit is not None
     again = fit(walks[2:])

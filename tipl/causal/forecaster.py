@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.causal.view import SCALE_STEPS, bases_of, local_scale, view
-from tipl.forecast import check_cadence, check_request
+from tipl.forecast import Pushed, check_cadence, check_request
 from tipl.gate.features import Clock
 from tipl.models.causal import CausalConfig, CausalGPT
 from weighttraj import Run
@@ -32,7 +32,7 @@ class CausalModelConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Causal:
+class Causal(Pushed):
     """tipl-causal: phi_t and a displacement within the directions of the path up to t.
 
     Before the path has as many directions as the basis, it is persistence. Its error is at least

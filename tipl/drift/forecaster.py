@@ -1,4 +1,4 @@
-"""tipl-gate with longer steps."""
+"""Forecasts followed further: tipl-gate with longer steps, and its rivals."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from safetensors.torch import save_file
 
 from tipl.baselines.files import ARRAYS, broken, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
+from tipl.forecast import Forecaster, Pushed, check_request
 from tipl.gate.forecaster import Gate, GateModelConfig
 from tipl.models.gate import GateConfig, GateNetwork
-from weighttraj import Run
+from weighttraj import ParamLayout, Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,7 @@ class DriftModelConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Drift:
+class Drift(Pushed):
     """phi_t + a_h d_h: the displacement d_h that tipl-gate forecasts, a_h times as long.
 
     A least-squares forecast is short, since it shrinks what it is not sure of: the mean of many
@@ -58,11 +59,7 @@ class Drift:
             ModelError: the run has another cadence, or longer iterations.
         """
         rows_of(list(self.amplitudes), horizons, self.name)
-        factors = np.ones((len(horizons), run.layout.size), np.float32)
-        factors *= np.array([[self.amplitudes[h]] for h in horizons], np.float32)
-        for param in run.layout.params:
-            if param.name == "log_std":
-                factors[:, param.slice] = 1
+        factors = _factors(run.layout, [self.amplitudes[h] for h in horizons])
         out = np.empty((len(starts), *factors.shape), np.float32)
         for place, weights, moved in self.gate.moves(run, starts, horizons):
             out[place] = weights + factors * moved
@@ -94,4 +91,86 @@ class Drift:
         return cls(gate, amplitudes, Path(path).resolve().name)
 
 
-__all__ = ["Drift", "DriftModelConfig"]
+@dataclass(frozen=True, kw_only=True)
+class FurtherConfig:
+    """What a saved one says of itself; what it follows lies in a folder beside it."""
+
+    amplitudes: dict[str, float]
+    """What the displacement of a horizon is multiplied by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Further:
+    """Any other forecast, followed as ``Drift`` follows that of tipl-gate: its rivals.
+
+    Between the horizons that amplitudes were chosen for they lie on lines in log h. Ours.
+    """
+
+    along: Forecaster
+    """Where to."""
+    amplitudes: dict[int, float]
+    """How far: a_h of some horizons."""
+    name: str = "further"
+    """Name in tables and figures: of the folder that it was loaded from."""
+    kind = "further"
+
+    @property
+    def causal(self) -> bool:
+        """Whether what it follows is."""
+        return self.along.causal
+
+    def forecast(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Float32[np.ndarray, "start horizon param"]:
+        """phi_t and the longer, or shorter, displacement.
+
+        Raises:
+            ForecastError: what it follows makes no such forecast.
+        """
+        check_request(run, starts, horizons)
+        now = run.weights[np.asarray(starts)][:, None]
+        moved = self.along.forecast(run, starts, horizons) - now
+        known = sorted(self.amplitudes)
+        chosen = np.interp(np.log(horizons), np.log(known), [self.amplitudes[h] for h in known])
+        return np.asarray(now + _factors(run.layout, chosen.tolist()) * moved)
+
+    def save(self, path: str | Path) -> None:
+        """Write config.json, and what it follows into a folder beside it."""
+        amplitudes = {str(h): a for h, a in self.amplitudes.items()}
+        write(path, {"kind": self.kind, "amplitudes": amplitudes})
+        self.along.save(Path(path) / _ALONG)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Further:
+        """Read a saved one.
+
+        Raises:
+            FileNotFoundError: there is no forecaster in the folder.
+            ForecastError: what it follows is not there.
+            ModelError: the files are another's, or damaged.
+        """
+        from tipl.zoo.lookup import load
+
+        config = read_config(path, cls.kind, FurtherConfig)
+        if not config.amplitudes or not all(h.isdecimal() and int(h) for h in config.amplitudes):
+            raise broken(path, f"amplitudes of {sorted(config.amplitudes)}, not of horizons")
+        amplitudes = {int(h): a for h, a in config.amplitudes.items()}
+        return cls(load(Path(path) / _ALONG), amplitudes, Path(path).resolve().name)
+
+
+_ALONG = "along"
+
+
+def _factors(
+    layout: ParamLayout, amplitudes: Sequence[float]
+) -> Float32[np.ndarray, "horizon param"]:
+    """What each displacement is multiplied by: the noise moves as the forecast says."""
+    factors = np.ones((len(amplitudes), layout.size), np.float32)
+    factors *= np.array(amplitudes, np.float32)[:, None]
+    for param in layout.params:
+        if param.name == "log_std":
+            factors[:, param.slice] = 1
+    return factors
+
+
+__all__ = ["Drift", "DriftModelConfig", "Further"]

@@ -1,4 +1,4 @@
-"""Chooses how far tipl-drift goes, by the returns of forecast policies on validation runs."""
+"""Chooses how far a forecast is followed, by returns of forecast policies on validation runs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import weighttraj as wt
 from tipl.baselines.horizons import fitted, rows_of
-from tipl.drift.forecaster import Drift
+from tipl.drift.forecaster import Drift, Further
 from tipl.errors import TrainError
 from tipl.evaluation import EvaluateConfig
 from tipl.evaluation.parts import Arrays, Parts, fingerprint, run_source
 from tipl.evaluation.returns import Player, forecast_returns, true_returns
 from tipl.evaluation.starts import starts_of
+from tipl.forecast import Forecaster
 from tipl.gate import Gate
 from tipl.prepare import digest_of
 from tipl.state import keep_settings
@@ -35,14 +36,14 @@ MODE = "held"
 class DriftConfig:
     """One choice of amplitudes."""
 
-    gate: Path
-    """Folder of a trained tipl-gate."""
+    along: str | Path
+    """What is followed: folder of a trained tipl-gate. Or another forecaster, by folder or name."""
     data: str | Path
     """Data set: a path or an id. Its validation runs, which need returns, choose."""
     out: Path
     """Folder of the model. What was measured before an interruption is kept there."""
     horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100)
-    """Snapshots ahead to choose for; other horizons of the network take what lies between."""
+    """Snapshots ahead to choose for; other horizons take what lies between."""
     amplitudes: tuple[float, ...] = (1, 1.5, 2, 3, 4, 6, 8)
     """Factors to choose from."""
     starts: int = 6
@@ -53,32 +54,38 @@ class DriftConfig:
     """Of the first episode."""
 
 
-def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift:
+def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift | Further:
     """Choose an amplitude for each horizon: the one with the highest inference gain.
 
     The gain is that of ``tipl evaluate``: how much the forecast adds to the return, as a share of
     what training adds until then, summed over starts and runs. At equal gain the shorter one.
 
     Args:
-        config: from which network, on what, and how much.
+        config: along which forecast, on what, and how much.
         console: where progress is shown; None: nowhere.
+
+    Returns:
+        tipl-drift if a tipl-gate is followed, else a rival of it.
 
     Raises:
         TrainError: there are no validation runs, or they do not learn; there are no factors; or the
             folder holds another choice.
-        ForecastError: the network was not trained for such a horizon.
+        ForecastError: there is no such forecaster, or it makes no forecast for such a horizon.
         EvaluateError: the runs have no returns, or are too short.
     """
-    gate, horizons = Gate.load(config.gate), fitted(config.horizons)
-    rows_of(gate.config.network.horizons, horizons, gate.name)
+    from tipl.zoo.lookup import load
+
+    along, horizons = load(config.along), fitted(config.horizons)
+    if isinstance(along, Gate):
+        rows_of(along.config.network.horizons, horizons, along.name)
     runs = [run for run in wt.open_dataset(config.data) if run.split == "validation"]
     _check(config, runs)
     settings = asdict(config) | {
-        "gate": fingerprint(gate),
+        "along": fingerprint(along),
         "chosen_on": str(config.data),
         "validation": {run.id: digest_of(run) for run in runs},
         "out": str(config.out),
-        **_trained_on(config.gate),
+        **_trained_on(Path(config.along)),
     }
     keep_settings(config.out, settings, ("out", "data", "chosen_on", "of_gate"))
     parts, factors = Parts(config.out / "parts"), tuple(sorted(config.amplitudes))
@@ -91,19 +98,19 @@ def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift
     )
     with Progress(*columns, console=console, disable=console.quiet) as progress:
         measured = [
-            parts.get(run.id, _source(settings, run), lambda run=run: _measure(gate, run, config))  # type: ignore[misc]
+            parts.get(run.id, _source(settings, run), lambda run=run: _measure(along, run, config))  # type: ignore[misc]
             for run in progress.track(runs)
         ]
     gains = gains_of(measured)
     best = [factors[row] for row in np.argmax(gains, axis=0)]
-    drift = Drift(gate, _between(gate, horizons, best), config.out.name)
-    drift.save(config.out)
+    followed = _followed(along, dict(zip(horizons, best, strict=True)), config.out.name)
+    followed.save(config.out)
     lines = [
         {"amplitude": factor} | {f"gain_{h}": gain for h, gain in zip(horizons, row, strict=True)}
         for factor, row in zip(factors, gains.tolist(), strict=True)
     ]
     (config.out / "log.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
-    return drift
+    return followed
 
 
 def gains_of(measured: Sequence[Arrays]) -> Float64[np.ndarray, "amplitude horizon"]:
@@ -129,16 +136,20 @@ def gains_of(measured: Sequence[Arrays]) -> Float64[np.ndarray, "amplitude horiz
     return gains
 
 
-def _between(gate: Gate, horizons: Sequence[int], best: Sequence[float]) -> dict[int, float]:
-    """An amplitude for each horizon of the network: those chosen, and lines in log h between."""
-    known = gate.config.network.horizons
-    found = np.interp(np.log(known), np.log(horizons), best)
-    return dict(zip(known, found.tolist(), strict=True))
+def _followed(
+    along: Forecaster, amplitudes: dict[int, float], name: str = "followed"
+) -> Drift | Further:
+    """A forecast that is followed so far; between these horizons, along lines in log h."""
+    if not isinstance(along, Gate):
+        return Further(along, amplitudes, name)
+    known = along.config.network.horizons
+    every = np.interp(np.log(known), np.log(list(amplitudes)), list(amplitudes.values()))
+    return Drift(along, dict(zip(known, every.tolist(), strict=True)), name)
 
 
-def _trained_on(gate: Path) -> dict[str, Any]:
+def _trained_on(along: Path) -> dict[str, Any]:
     """The data sets and runs that the network was trained on, and how, where its folder says so."""
-    file = gate / "train.json"
+    file = along / "train.json"
     settings = json.loads(file.read_text()) if file.exists() else {}
     data, runs = settings.pop("data", None), settings.pop("runs", None)
     settings.pop("out", None)
@@ -162,11 +173,11 @@ def _check(config: DriftConfig, runs: Sequence[wt.Run]) -> None:
 
 
 def _source(settings: dict[str, Any], run: wt.Run) -> dict[str, Any]:
-    ours = ("gate", "horizons", "amplitudes", "starts", "episodes", "seed")
+    ours = ("along", "horizons", "amplitudes", "starts", "episodes", "seed")
     return {name: settings[name] for name in ours} | run_source(run)
 
 
-def _measure(gate: Gate, run: wt.Run, config: DriftConfig) -> Arrays:
+def _measure(along: Forecaster, run: wt.Run, config: DriftConfig) -> Arrays:
     horizons = fitted(config.horizons)
     protocol = EvaluateConfig(
         data=config.data,
@@ -187,8 +198,8 @@ def _measure(gate: Gate, run: wt.Run, config: DriftConfig) -> Arrays:
         now = true["now"][0, :, None]
         added = []
         for factor in sorted(config.amplitudes):
-            drift = Drift(gate, dict.fromkeys(horizons, factor))
-            found = forecast_returns(drift, player, run, starts, horizons, quiet)["forecast"][0]
+            followed = _followed(along, dict.fromkeys(horizons, factor))
+            found = forecast_returns(followed, player, run, starts, horizons, quiet)["forecast"][0]
             added.append((found - now).sum(0))
     return {"forecast": np.stack(added), "training": (true["later"][0] - now).sum(0)}
 

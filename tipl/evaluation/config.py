@@ -23,7 +23,7 @@ class EvaluateConfig:
     horizons: tuple[int, ...] = HORIZONS
     """Snapshots ahead; those beyond half of the shortest run are left out."""
     starts: int = 2_000
-    """Starts in each run, evenly spaced, for errors of weights; all if there are fewer."""
+    """Starts in each run for errors of weights: the first moments, then evenly spaced."""
     function_starts: int = 400
     """Of these, starts for divergences of policies on stored observations; 0: none."""
     return_horizons: tuple[int, ...] = (*range(1, 11), 20, 50, 100)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -34,15 +35,16 @@ class Bootstrap:
         """A statistic of all runs, for each of its cells in order.
 
         Args:
-            statistic: called with the samples, or with drawn runs of all of them.
+            statistic: reduces the first axis, the run, of arrays that may have one axis more than
+                the samples after it: that of the resamples.
             samples: the first axis is the run.
         """
         value, runs = statistic(*samples), len(samples[0])
-        drawn = []
-        if runs > 1:
-            picks = np.random.default_rng(self.seed).integers(runs, size=(self.resamples, runs))
-            drawn = [statistic(*(sample[pick] for sample in samples)) for pick in picks]
-        return _intervals(value, drawn)
+        if runs == 1:
+            return [{"value": _plain(v), "low": None, "high": None} for v in np.ravel(value)]
+        picks = np.random.default_rng(self.seed).integers(runs, size=(self.resamples, runs))
+        drawn = statistic(*(sample[picks.T] for sample in samples))
+        return _intervals(value, drawn.reshape(self.resamples, -1))
 
 
 def ratio_of_sums(
@@ -77,19 +79,18 @@ def interquartile_mean(values: Float[np.ndarray, "run *cell"]) -> Float[np.ndarr
     return np.tensordot(share / share.sum(), np.sort(values, axis=0), axes=1)
 
 
-def _intervals(value: np.ndarray, drawn: list[np.ndarray]) -> list[Interval]:
-    values = np.ravel(value).tolist()
-    if not drawn:
-        return [{"value": _plain(v), "low": None, "high": None} for v in values]
-    low, high = np.quantile(np.stack([np.ravel(d) for d in drawn]), (0.025, 0.975), axis=0)
+def _intervals(
+    value: Float[np.ndarray, "*cell"], drawn: Float[np.ndarray, "resample cells"]
+) -> list[Interval]:
+    low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
     return [
         {"value": _plain(v), "low": _plain(a), "high": _plain(b)}
-        for v, a, b in zip(values, low.tolist(), high.tolist(), strict=True)
+        for v, a, b in zip(np.ravel(value), low, high, strict=True)
     ]
 
 
-def _plain(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _plain(value: np.floating[Any]) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 __all__ = ["Bootstrap", "Interval", "interquartile_mean", "mean", "quotient", "ratio_of_sums"]

@@ -222,8 +222,8 @@ def _skill(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
 
 
 def _skill_of_tensors(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
-    each = 1 - ratio_of_sums(error, copy)  # (horizon, tensor); NaN: it never moves
-    return mean(np.moveaxis(each, 1, 0))
+    each = 1 - ratio_of_sums(error, copy)  # (..., horizon, tensor); NaN: it never moves
+    return mean(np.moveaxis(each, -1, 0))
 
 
 _SKILLS: dict[str, Callable[..., np.ndarray]] = {

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
-from tipl.forecast import check_cadence, check_request
+from tipl.forecast import Pushed, check_cadence, check_request
 from tipl.gate.features import Clock, Features, Structure, features
 from tipl.gate.history import histories
 from tipl.models.gate import GateConfig, GateNetwork
@@ -36,7 +36,7 @@ class GateModelConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Gate:
+class Gate(Pushed):
     """tipl-gate: phi_t and a mixture of linear filters on each parameter's own past.
 
     One file serves policies of any size. A forecast from t has seen phi_0, ..., phi_t, the phase
