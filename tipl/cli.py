@@ -7,7 +7,7 @@ import signal
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -65,7 +65,7 @@ def _train_gate(config: GateTrainConfig) -> None:
 @app.command(name="train-drift")
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _train_drift(config: DriftConfig) -> None:
-    """Choose how far to go along a tipl-gate's forecast, by the returns of validation runs."""
+    """Choose how far to go along a forecast, a tipl-gate's, say, by returns of validation runs."""
     signal.signal(signal.SIGTERM, _stop)
     drift = train_drift(config, console=console)
     print(f"model in {config.out}: {drift.amplitudes}")
@@ -169,11 +169,16 @@ def _check(
 @app.command(name="zoo")
 def _zoo() -> None:
     """List the released models."""
-    table = Table()
-    for column in ("name", "kind", "causal", "data set", *HEADLINE):
-        table.add_column(column, justify="right" if column in HEADLINE else "left")
+    table, wide = Table(), console.width >= _WIDE
+    columns = {"name": True, "kind": wide, "causal": True, "data set": wide}
+    columns |= dict.fromkeys(HEADLINE, True)
+    for column, shown in columns.items():
+        if shown:
+            justify: Literal["left", "right"] = "right" if column in HEADLINE else "left"
+            table.add_column(column, justify=justify, no_wrap=column == "name")
     for name in tipl.zoo.names():
-        table.add_row(*(escape(text) for text in listed(name)))
+        cells = zip(listed(name, interval=wide), columns.values(), strict=True)
+        table.add_row(*(escape(text) for text, shown in cells if shown))
     console.print(table)
 
 

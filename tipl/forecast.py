@@ -58,6 +58,29 @@ class Forecaster(Protocol):
         ...
 
 
+class Pushed:
+    """Base of the models that people publish."""
+
+    def push_to_hub(self, repo: str, *, private: bool = False, card: Path | None = None) -> str:
+        """Publish on the Hugging Face hub, in one commit: ``tipl.push`` to ``hf://<repo>``.
+
+        Args:
+            repo: ``organisation/name``.
+            private: of a new repository: only its organisation sees it.
+            card: the model's card, Markdown, which it must have.
+
+        Returns:
+            The address that ``tipl.load`` takes, with the commit that it is now.
+
+        Raises:
+            ForecastError: it has no card.
+            RemoteError: the hub cannot be reached, or refuses.
+        """
+        from tipl.zoo.remote import push
+
+        return push(self, f"hf://{repo}", private=private, card=card)  # type: ignore[arg-type]
+
+
 def check_request(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> None:
     """Check what a forecaster was asked for.
 
@@ -117,7 +140,7 @@ class TIPLConfig:
 
 
 @dataclass(frozen=True)
-class TIPL:
+class TIPL(Pushed):
     """The trained network as a forecaster."""
 
     model: GPT

@@ -143,7 +143,8 @@ def _list() -> None:
     """List the data sets that can be named by an id here."""
     table = Table(title="data sets")
     for column in ("id", "version", "status", "runs", "MB", "path"):
-        table.add_column(column, justify="right" if column in ("runs", "MB") else "left")
+        justify: Literal["left", "right"] = "right" if column in ("runs", "MB") else "left"
+        table.add_column(column, justify=justify, overflow="fold", no_wrap=column == "id")
     for dataset in registry.local_datasets():
         try:
             info = dataset.info
@@ -163,17 +164,19 @@ def _search(
             help="a condition, such as \"env == 'HalfCheetah-v4' and final_return > 3000\""
         ),
     ],
-    columns: Annotated[tuple[str, ...], tyro.conf.arg(help="what is shown of each run")] = (
-        *("dataset", "run_id", "env", "algorithm", "seed", "split"),
-        *("n_snapshots", "n_params", "final_return"),
-    ),
+    columns: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(
+            help="what is shown of each run; also env, algorithm, n_snapshots, n_params, ..."
+        ),
+    ] = ("dataset", "run_id", "split", "seed", "final_return"),
 ) -> None:
     """Find runs of all data sets that are here, by their environment, return, hyper-parameters."""
     found = registry.search(query)
     table = Table(title=f"{len(found)} runs")
     shown = [column for column in columns if column in found.columns]
     for column in shown:
-        table.add_column(column)
+        table.add_column(column, overflow="fold", no_wrap=column in ("dataset", "run_id"))
     for row in found[shown].itertuples(index=False):
         table.add_row(*(escape(_text(value)) for value in row))
     console.print(table)
@@ -301,7 +304,7 @@ class _Verify:
 def _verify(args: _Verify) -> None:
     """Is it whole? Exit with 1 if something is missing, damaged or not what it says."""
     path = locate(args.path)
-    problems = wt.verify(path, deep=args.deep)
+    problems = wt.verify(path, deep=args.deep, console=console)
     if args.replay and not problems:
         problems += wt.collect.replay(path, args.replay, seed=args.seed)
     _finish(path, problems, f"whole{_state_of(path)}")
@@ -313,7 +316,9 @@ def _lint(
 ) -> None:
     """Is it what it says it is? Look for duplicates, gaps, jumps; exit with 1 on findings."""
     path = locate(path)
-    _finish(path, [str(finding) for finding in wt.lint(path)], "nothing suspicious")
+    _finish(
+        path, [str(finding) for finding in wt.lint(path, console=console)], "nothing suspicious"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,7 +336,7 @@ def _repair(args: _Repair) -> None:
     path = locate(args.path)
     for step in wt.repair(path, cut=args.cut):
         print(step)
-    _finish(path, wt.verify(path), f"whole{_state_of(path)}")
+    _finish(path, wt.verify(path, console=console), f"whole{_state_of(path)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,13 +45,14 @@ _TESTS = {
 }
 
 
-def listed(name: str) -> tuple[str, ...]:
+def listed(name: str, *, interval: bool = True) -> tuple[str, ...]:
     """A line of ``tipl zoo``: name, kind, causal, data set, and the figures of ``HEADLINE``."""
     folder = lookup.MODELS / name
     metrics = read_metrics(folder)
     if metrics is None:
         return (name, lookup.kind_of(folder), *["-"] * (2 + len(HEADLINE)))
-    figures = [cell(row_at(metrics.scores, *COLUMNS[column])) for column in HEADLINE]
+    rows = [row_at(metrics.scores, *COLUMNS[column]) for column in HEADLINE]
+    figures = [cell(row, interval=interval) for row in rows]
     causal = "yes" if metrics.causal else "no"
     return (name, metrics.kind, causal, metrics.results["data"], *figures)
 
@@ -305,7 +306,7 @@ def _commands(metrics: Metrics) -> str:
         of_network, of_amplitudes = given.values()
         commands += [
             f"tipl train-gate --data {data} --out GATE {of_network}",
-            f"tipl train-drift --gate GATE --data {data} --out FOLDER {of_amplitudes}",
+            f"tipl train-drift --along GATE --data {data} --out FOLDER {of_amplitudes}",
         ]
     elif metrics.trained_on and metrics.kind in _COMMANDS:
         commands.append(f"tipl {_COMMANDS[metrics.kind]} --data {data} --out FOLDER {given['']}")

@@ -9,7 +9,7 @@ from typing import Any
 
 from tipl import baselines
 from tipl.causal import Causal
-from tipl.drift import Drift
+from tipl.drift import Drift, Further
 from tipl.errors import ForecastError, ModelError
 from tipl.forecast import TIPL, Forecaster
 from tipl.gate import Gate
@@ -21,6 +21,7 @@ KINDS: dict[str, type[Forecaster]] = {
     Gate.kind: Gate,
     Causal.kind: Causal,
     Drift.kind: Drift,
+    Further.kind: Further,
     **baselines.KINDS,
 }
 """The class of each ``kind`` that config.json of a saved forecaster may name."""

@@ -41,6 +41,7 @@ _OF_THE_MACHINE = (
     "data",
     "out",
     "runs",
+    "along",
     "gate",
     "chosen_on",
     "validation",

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -139,12 +139,19 @@ def parse_manifest(content: bytes | None, where: object) -> list[ManifestLine]:
     return lines
 
 
-def check_manifest(path: Path) -> list[str]:
-    """Objects that are missing, changed or not in the manifest, in words."""
+def check_manifest(
+    path: Path, shown: Callable[[list[ManifestLine]], Iterable[ManifestLine]] = iter
+) -> list[str]:
+    """Objects that are missing, changed or not in the manifest, in words.
+
+    Args:
+        path: of the data set.
+        shown: what goes through the lines, and shows how far it is.
+    """
     lines = read_manifest(path)
     present = set(_objects(path))
     problems = []
-    for line in lines:
+    for line in shown(lines):
         where = path / line.path
         if line.path not in present:
             problems.append(f"{where}: missing, the manifest lists it")

@@ -7,11 +7,15 @@ import json
 import math
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from weighttraj.errors import DamageError, FormatError, WeightTrajError
 from weighttraj.format.catalog import (
@@ -38,12 +42,17 @@ _DRAFT = re.compile(r"\..+\.\d+\.draft")
 _DROPPED = "damaged returns dropped; weighttraj returns evaluates the snapshots again"
 
 
-def verify(path: str | Path, *, deep: bool = False) -> list[str]:
+def verify(path: str | Path, *, deep: bool = False, console: Console | None = None) -> list[str]:
     """Problems of the data set, run or HDF5 file at a path; an empty list means that it is whole.
 
     Every byte is read. Of a complete data set, each object is compared with its hash in the
     manifest and each snapshot with its digest. Of anything else, or with ``deep``, every chunk is
     decoded too, counters must not go back and weights must be finite.
+
+    Args:
+        path: data set, run or HDF5 file.
+        deep: decode everything.
+        console: where progress is shown; None: nowhere.
 
     Raises:
         FileNotFoundError: there is neither a data set nor a run at the path.
@@ -51,7 +60,7 @@ def verify(path: str | Path, *, deep: bool = False) -> list[str]:
     path = here(path)
     try:
         if (path / "dataset.json").is_file():
-            return _verify_dataset(open_dataset(path), deep)
+            return _verify_dataset(open_dataset(path), deep, console or Console(quiet=True))
         if path.suffix == ".h5":
             return [p for run in open_dataset(path) for p in _verify_arrays(run, deep=True)]
         return list(_verify_run(open_run(path), deep=True))
@@ -131,18 +140,19 @@ def repair(path: str | Path, *, cut: bool = False) -> list[str]:
     return done
 
 
-def check_manifest_quietly(path: Path) -> list[str]:
+def check_manifest_quietly(path: Path, shown: Callable[..., Any] = iter) -> list[str]:
     """Problems of the manifest, also when it cannot be read."""
     try:
-        return check_manifest(path)
+        return check_manifest(path, shown)
     except WeightTrajError as error:
         return [str(error)]
 
 
-def _verify_dataset(dataset: Dataset, deep: bool) -> list[str]:
-    complete = dataset.info.status == "complete"
-    problems = check_manifest_quietly(Path(dataset.path)) if complete else []
-    for run in dataset:
+def _verify_dataset(dataset: Dataset, deep: bool, console: Console) -> list[str]:
+    bar = partial(track, console=console, disable=console.quiet, transient=True)
+    complete, path = dataset.info.status == "complete", Path(dataset.path)
+    problems = check_manifest_quietly(path, partial(bar, description="files")) if complete else []
+    for run in bar(dataset.runs, description="runs"):
         try:
             problems += _verify_run(run, deep=deep or not complete)
         except WeightTrajError as error:

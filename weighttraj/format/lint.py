@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from weighttraj.format.reader import Run, open_dataset, open_run
 from weighttraj.remote.address import here
@@ -34,7 +36,7 @@ class Finding:
         return f"{self.run}: {self.check}: {self.message}"
 
 
-def lint(path: str | Path) -> list[Finding]:
+def lint(path: str | Path, *, console: Console | None = None) -> list[Finding]:
     """What is suspicious about a data set or run; an empty list means nothing.
 
     Checks: ``duplicate`` (snapshots that equal another one), ``final`` (snapshots that equal the
@@ -44,13 +46,18 @@ def lint(path: str | Path) -> list[Finding]:
     agent without recorded normaliser), ``short`` (fewer snapshots than the other runs have),
     ``twin`` (runs with the same weights).
 
+    Args:
+        path: data set or run.
+        console: where progress is shown; None: nowhere.
+
     Raises:
         FileNotFoundError: there is neither a data set nor a run at the path.
         DamageError: it is not whole: see ``verify``.
     """
     path = here(path)
     runs = open_dataset(path).runs if (path / "dataset.json").is_file() else [open_run(path)]
-    findings = [finding for run in runs for finding in lint_run(run)]
+    bar = track(runs, "runs", console=console, disable=console is None, transient=True)
+    findings = [finding for run in bar for finding in lint_run(run)]
     return findings + list(_between(runs))
 
 

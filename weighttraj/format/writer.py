@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -71,6 +71,8 @@ class RunWriter:
         self.path = path
         self.replayed_from = info.n_committed
         """Committed snapshots found at the start: that many are compared, not written."""
+        specs = list(self._store.specs.values())
+        self._specs = {axis: [s for s in specs if s.axis == axis] for axis in AXES}
         self._committed_digests = self._store.read("digest", slice(0, info.n_committed))
         self._at_start = {axis: info.committed(axis) for axis in AXES}
         self._compared: dict[Axis, int] = dict.fromkeys(AXES, 0)
@@ -142,7 +144,7 @@ class RunWriter:
         """Append one row of the iteration-indexed arrays: network inputs of its rollout.
 
         Raises:
-            SnapshotError: the shape is not (``info.probe_observations``, *observation).
+            SnapshotError: the shape is not ``(info.probe_observations, *observation)``.
         """
         self._append("iteration", {"probe/observations": probe_observations})
 
@@ -150,7 +152,7 @@ class RunWriter:
         """Write and commit everything appended so far."""
         store = self._store
         for axis, block in self._blocks.items():
-            for spec in self._specs(axis) if block.rows else []:
+            for spec in self._specs[axis] if block.rows else []:
                 store.write(spec.name, block.first, [row[spec.name] for row in block.rows])
         time, iteration = (self._blocks[a].first + len(self._blocks[a].rows) for a in AXES)
         store.commit(with_progress(store.info, status=status, time=time, iteration=iteration))
@@ -190,8 +192,7 @@ class RunWriter:
     def _append(self, axis: Axis, values: Mapping[str, Any]) -> None:
         if self._closed:
             raise SnapshotError("the run is closed", where=self.path, do="open a new RunWriter")
-        specs = self._specs(axis)
-        rows = {spec.name: _row(spec, values) for spec in specs}
+        rows = _rows(self._specs[axis], values)
         unknown = sorted(values.keys() - rows.keys())
         if unknown:
             raise SnapshotError(
@@ -223,14 +224,11 @@ class RunWriter:
                 "run.info.provenance names, or collect under a new run id",
             )
 
-    def _specs(self, axis: Axis) -> list[ArraySpec]:
-        return [spec for spec in self._store.specs.values() if spec.axis == axis]
-
     def _tail(self, axis: Axis) -> _Block:
         """The last, partly filled block: it will be written again as a whole."""
         n = self._store.info.committed(axis)
         first = n // self._store.info.block * self._store.info.block
-        tail = {s.name: self._store.read(s.name, slice(first, n)) for s in self._specs(axis)}
+        tail = {s.name: self._store.read(s.name, slice(first, n)) for s in self._specs[axis]}
         rows = [{name: np.asarray(v[i]) for name, v in tail.items()} for i in range(n - first)]
         return _Block(first, rows)
 
@@ -325,27 +323,33 @@ def _moments(name: str, moments: Moments | None) -> dict[str, Any]:
     return dict(zip((f"{name}/mean", f"{name}/var", f"{name}/count"), moments, strict=True))
 
 
-def _row(spec: ArraySpec, values: Mapping[str, Any]) -> np.ndarray:
-    optional = spec.name.startswith(_MAY_BE_NAN)
-    if spec.name not in values and not optional:
-        raise SnapshotError(
-            "the snapshot lacks a value that this run stores",
-            expected=f"{spec.name}, {spec.dtype} {spec.inner}",
-            got=f"only {sorted(values)}",
-            do="pass it to append",
-        )
-    if spec.name not in values:
-        return np.full(spec.inner, spec.fill, spec.dtype)
-    row = np.array(values[spec.name], spec.dtype)
-    if row.shape != spec.inner:
-        raise SnapshotError(
-            "a value of the snapshot has the wrong shape",
-            expected=spec.inner,
-            got=row.shape,
-            where=spec.name,
-            do="pass what the run's layout and normaliser describe",
-        )
-    return row if optional or row.dtype.kind != "f" else check_finite(spec.name, row)
+def _rows(specs: Sequence[ArraySpec], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """What is stored of one snapshot or iteration, array by array; one loop, since it is hot."""
+    rows = {}
+    for spec in specs:
+        value, optional = values.get(spec.name), spec.name.startswith(_MAY_BE_NAN)
+        if value is None and not optional:
+            raise SnapshotError(
+                "the snapshot lacks a value that this run stores",
+                expected=f"{spec.name}, {spec.dtype} {spec.inner}",
+                got=f"only {sorted(values)}",
+                do="pass it to append",
+            )
+        if value is None:
+            value = np.full(spec.inner, spec.fill)
+        row = np.array(value, spec.dtype)
+        if row.shape != spec.inner:
+            raise SnapshotError(
+                "a value of the snapshot has the wrong shape",
+                expected=spec.inner,
+                got=row.shape,
+                where=spec.name,
+                do="pass what the run's layout and normaliser describe",
+            )
+        if not optional and row.dtype.kind == "f" and not np.isfinite(row).all():
+            check_finite(spec.name, row)
+        rows[spec.name] = row
+    return rows
 
 
 def check_finite(name: str, row: np.ndarray) -> np.ndarray:

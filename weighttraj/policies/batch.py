@@ -26,8 +26,8 @@ class PolicyBatch:
         layout: order of the parameters in ``weights``.
         weights: float32 (policy, param).
         obs_norm: what is fixed about the normalisers; None: observations go in as they are.
-        mean: of the normalisers, (policy, *obs).
-        var: of the normalisers, (policy, *obs).
+        mean: of the normalisers, ``(policy, *obs)``.
+        var: of the normalisers, ``(policy, *obs)``.
 
     Raises:
         PolicyError: the spec describes no policy that can be rebuilt.
@@ -62,7 +62,7 @@ class PolicyBatch:
         return PolicyBatch(self.spec, self.layout, weights, self.obs_norm, self.mean, self.var)
 
     def normalize(self, observations: np.ndarray) -> np.ndarray:
-        """Network inputs, float32, for raw observations (policy, episode, *obs)."""
+        """Network inputs, float32, for raw observations ``(policy, episode, *obs)``."""
         if self.mean is None or self.var is None:
             return np.asarray(observations, np.float32)
         return normalize(observations, self.obs_norm, self.mean[:, None], self.var[:, None])
@@ -88,10 +88,10 @@ class PolicyBatch:
 
     @torch.no_grad()
     def act(self, observations: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
-        """Actions (policy, episode, *action), clipped to the action space.
+        """Actions ``(policy, episode, *action)``, clipped to the action space.
 
         Args:
-            observations: raw, (policy, episode, *obs).
+            observations: raw, ``(policy, episode, *obs)``.
             noise: None: act by the distribution's mode. For a Gaussian head: standard normal,
                 float32 (episode, action). For a categorical one: uniform in [0, 1), (episode,).
         """

@@ -69,7 +69,7 @@ class Policy:
 
     @torch.no_grad()
     def distribution(self, inputs: Tensor) -> Normal | Categorical:
-        """Distribution over unclipped actions for network inputs (batch, *observation)."""
+        """Distribution over unclipped actions for network inputs ``(batch, *observation)``."""
         hidden = inputs.flatten(1)
         activation = ACTIVATIONS[self.spec.activation]
         for weight, bias in self._layers[:-1]:
@@ -89,7 +89,7 @@ class Policy:
         """Actions for raw observations; SB3's signature.
 
         Args:
-            observation: (*observation) or (batch, *observation), not normalised.
+            observation: ``(*observation)`` or ``(batch, *observation)``, not normalised.
             state: returned as it is; these policies have no memory.
             episode_start: not used.
             deterministic: the distribution's mode, else a sample by torch's global generator.

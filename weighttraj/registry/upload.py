@@ -40,7 +40,8 @@ def upload(
     hub) or another address.
 
     Args:
-        path: a complete data set on this machine, path or id, with a card and a licence.
+        path: a complete data set on this machine, path or id, with a licence and a card that says
+            how to cite it.
         address: ``hf://org/name``, ``s3://bucket/prefix``, ``gs://``, ``az://``, ``file://``.
         despite_lint: publish what looks suspicious; say why in the card.
         private: of a new repository on the hub: only its organisation sees it.
@@ -90,6 +91,14 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             got="none",
             where=folder,
             do=f"weighttraj card {folder}",
+        )
+    if "\n## Citation\n" not in (folder / CARD).read_text():
+        raise RegistryError(
+            "the card does not say how the data set is to be cited",
+            expected=f"a section '## Citation' in {CARD}",
+            got="none",
+            where=folder,
+            do="write one, or let `weighttraj card` make the card",
         )
     if problems := verify(folder):
         raise RegistryError(
