@@ -3,8 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := data/demo
 RELEASED := inverted-pendulum-v4-ppo-v1
+# Baselines that are followed further, as tipl-drift follows the gate.
+RIVALS := last-step trend-20 ema-0.9 data/results/ladder/ar-20-phase
 
-.PHONY: demo test lint bench results stress setup clean-demo
+.PHONY: demo test lint docs bench results stress setup clean-demo
 
 setup: .venv/installed
 
@@ -23,12 +25,15 @@ demo: setup ## open the released data, collect a run beside it, train TIPL, judg
 	$(BIN)/tipl evaluate $(DEMO)/tipl --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/report --quick --workers 2
 
 test: setup ## run the tests
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 lint: setup ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+docs: setup ## build the pages as one site, docs/_build/index.html
+	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . docs/_build
 
 bench: setup ## measure on two real runs (an hour to collect them), keep the numbers, write them into docs/benchmarks.md
 	$(BIN)/weighttraj collect tests/benchmarks/inverted-pendulum.toml --out data/bench/inverted-pendulum
@@ -48,7 +53,8 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 
 results: setup ## judge the zoo and the baselines, write docs/results.md: two hours
 	$(BIN)/tipl fit $(RELEASED) --out data/results/ladder
-	$(BIN)/tipl evaluate tipl-inverted-pendulum-v4 tipl-gate-inverted-pendulum-v4 tipl-drift-inverted-pendulum-v4 data/results/ladder/* --data $(RELEASED) --out data/results/full --return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1 --workers 2
+	for along in $(RIVALS); do $(BIN)/tipl train-drift --along $$along --data $(RELEASED) --out data/results/further/$$(basename $$along)-further --amplitudes 0.25 0.5 1 1.5 2 3 4 6 8 || exit 1; done
+	$(BIN)/tipl evaluate tipl-inverted-pendulum-v4 tipl-gate-inverted-pendulum-v4 tipl-drift-inverted-pendulum-v4 tipl-causal-inverted-pendulum-v4 data/results/ladder/* data/results/further/* --data $(RELEASED) --out data/results/full --return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1 --workers 2
 	cp data/results/full/results.json docs/results/$(RELEASED).json
 	$(BIN)/tipl report docs/results/$(RELEASED).json --into docs/results.md
 

@@ -20,6 +20,7 @@ import torch  # noqa: E402
 import weighttraj as wt  # noqa: E402
 from tests.small import SMALL_RECIPE  # noqa: E402
 from weighttraj.collect import PPOConfig, WeightTrajectoryCallback, collect, make_ppo  # noqa: E402
+from weighttraj.registry import create  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -61,6 +62,22 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "small"
 
 
+@pytest.fixture(scope="session")
+def few_released(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five runs of the released data, which released models are for. Do not write to it."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    path = root / "few/inverted-pendulum-v4-ppo-v1"
+    with FileLock(root / "few.lock"):
+        if not path.exists():
+            path.parent.mkdir()
+            chosen = wt.open("inverted-pendulum-v4-ppo-v1").select(seed=[0, 7, 30, 40, 41])
+            splits = {run.id: run.split for run in chosen}
+            create([str(run.path) for run in chosen], path, splits=splits)
+    return path
+
+
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 64 KiB; ``grow`` makes it larger."""
@@ -75,3 +92,24 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("no small disk can be mounted here")
     yield path
     subprocess.run(["umount", "-l", str(path)], check=True)  # noqa: S607
+
+
+@pytest.fixture
+def reader(tmp_path: Path, few_released: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where a reader of our pages stands: a home of their own, fewer runs, shorter recipes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(few_released.parent))
+    short = "n_steps = 64\nbatch_size = 16\nn_epochs = 2\ncritic_arch = [8, 8]"
+    for name, changes in {
+        "demo": {"51_200": f"768\n{short}", "every = 64": "every = 2\nblock = 8"},
+        "inverted-pendulum-v4-ppo-v1": {"800_000": "4_096"},
+    }.items():
+        recipe = (Path(__file__).parents[1] / f"datasets/{name}/recipe.toml").read_text()
+        for long, shorter in changes.items():
+            assert long in recipe
+            recipe = recipe.replace(long, shorter)
+        copy = tmp_path / f"datasets/{name}/recipe.toml"
+        copy.parent.mkdir(parents=True)
+        copy.write_text(recipe)
+    return tmp_path

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
-import re
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +10,7 @@ import numpy as np
 import pytest
 
 import weighttraj as wt
+from tests.pages import run_page
 from tests.small import SMALL_RECIPE
 from weighttraj.collect import read_recipe
 from weighttraj.collect.population import check_config
@@ -22,7 +19,6 @@ from weighttraj.collect.recipe import SPLITS
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(ROOT.glob("datasets/*/recipe.toml"))
 PAGE = (ROOT / "datasets/README.md").read_text()
-BLOCKS = re.findall(r"```(python|bash)\n(.*?)```", PAGE, re.DOTALL)
 
 # The page runs as it stands, on shorter trainings: a second each.
 SHORT = "256\nn_steps = 64\nbatch_size = 16\nn_epochs = 8"
@@ -72,28 +68,7 @@ def test_every_block_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monkey
         copy = tmp_path / path.relative_to(ROOT)
         copy.parent.mkdir(parents=True)
         copy.write_text(path.read_text().replace("1_000_000", SHORT).replace('"0:6"', '"0:2"'))
-    used = set()
-    names: dict[str, object] = {}
-    script = f'set -eu\nweighttraj() {{ "{sys.executable}" -m weighttraj.cli "$@"; }}\n'
-    for kind, text in BLOCKS:
-        block = text
-        for long, short in SHORTER.items():
-            used |= {long} if long in block else set()
-            block = block.replace(long, short)
-        if kind == "python":
-            exec(compile(block, "datasets/README.md", "exec"), names)  # noqa: S102
-        else:
-            script += block
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        ["bash", "-c", script],  # noqa: S607
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environment,
-    )
-    assert done.returncode == 0, f"{done.stdout}{done.stderr}"
-    assert used == set(SHORTER)
+    run_page(ROOT / "datasets/README.md", SHORTER)
     for name, runs in (("swimmer-short", 6), ("reacher-v4-ppo-v1", 6), ("walker", 4)):
         assert len(wt.open(tmp_path / "data" / name).info.runs) == runs
 
@@ -134,9 +109,3 @@ def test_the_facts_are_fresh(path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     page = (path.parent / "README.md").read_text()
     told = f"run: python tests/benchmarks/facts.py {path.parent.name}"
     assert facts.insert(page, wt.open(path)) == page, told
-
-
-def test_links_of_the_page_lead_somewhere() -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", PAGE):
-        path = target.split("#")[0]
-        assert target.startswith("https://") or (ROOT / "datasets" / path).exists(), target

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+import tipl
 import weighttraj as wt
+from tests.pages import QUICKER, run_page
 
 DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
@@ -25,27 +25,9 @@ def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPa
     assert study.insert(stale) == page != stale
 
 
-def run_blocks(name: str, change: tuple[str, str] = ("", "")) -> dict[str, Any]:
-    """Run the Python of a guide; returns its names."""
-    names: dict[str, Any] = {}
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / f"{name}.md").read_text(), re.DOTALL)
-    for block in blocks:
-        exec(compile(block.replace(*change), f"{name}.md", "exec"), names)  # noqa: S102
-    return names
-
-
-def test_publish_and_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    names = run_blocks("publish", ("/tmp/weighttraj-published", f"{tmp_path}/published"))  # noqa: S108
-    assert names["window"].shape == (20, 122)
-    assert len(names["copy"]) == 50
-    assert [len(run) for run in names["part"]] == [241, 241]
-    assert wt.verify(tmp_path / "published/inverted-pendulum-v4-ppo-v1") == []
-
-
 def test_bring_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = run_blocks("bring-your-own")
+    names = run_page(DOCS / "bring-your-own.md")
     for path in tmp_path.glob("data/mine/*.zarr"):
         assert wt.verify(path) == []
     made = wt.open("data/mine/all")
@@ -56,3 +38,40 @@ def test_bring_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     }
     before, after = names["returns"].returns.mean(1)
     assert after > before
+
+
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs:zarr.errors.ZarrUserWarning")
+def test_read(reader: Path) -> None:
+    run_page(DOCS / "index.md")
+    names = run_page(DOCS / "read.md")
+    assert names["weights"].shape == (122, 1951)
+    assert names["second"]["weights"].shape == (4, 20, 122)
+    assert len(wt.open("data/demo/divided.h5")) == 5
+
+
+@pytest.mark.timeout(300)
+def test_collect(reader: Path) -> None:
+    run_page(DOCS / "collect.md", {"--episodes 5": "--episodes 1"})
+    assert len(wt.open("data/both")) == 7
+    assert wt.verify("data/both") == []
+
+
+@pytest.mark.timeout(300)
+def test_train(reader: Path) -> None:
+    shorter = {
+        "--n-batches 500": "--n-batches 4",
+        "--n-batches 400": "--n-batches 4",
+        "--n-batches 100": "--n-batches 4",
+        "n_batches=50": "n_batches=4",
+        "--steps 500": "--steps 4",
+    }
+    run_page(DOCS / "train.md", shorter)
+    for name in ("tipl", "tipl-2", "tipl-python", "tipl-gate", "tipl-drift", "tipl-causal"):
+        assert tipl.load(f"data/demo/{name}").name == name
+
+
+@pytest.mark.timeout(300)
+def test_evaluate(reader: Path) -> None:
+    names = run_page(DOCS / "evaluate.md", {"--quick": QUICKER, "--episodes 5": "--episodes 1"})
+    assert names["after"] > names["before"] + 100
+    assert "half-step" in names["results"]["forecasters"]

@@ -267,6 +267,7 @@ ALLOWED = {
         "tipl.representation",
         "tipl.tokens",
         "door weighttraj",
+        "later tipl.zoo.remote",
     ],
     "tipl.baselines": [
         "tipl.baselines",
@@ -294,8 +295,10 @@ ALLOWED = {
         "tipl.drift",
         "tipl.errors",
         "tipl.evaluation",
+        "tipl.forecast",
         "tipl.gate",
         "tipl.models",
+        "later tipl.zoo.lookup",
         "tipl.prepare",
         "tipl.state",
         "door weighttraj",

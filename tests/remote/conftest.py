@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import boto3
+import huggingface_hub.constants
 import pytest
 
 import weighttraj as wt
+from tests.remote import hub as stand_in
 from tests.remote import servers
 from weighttraj.registry import create
+from weighttraj.remote.store import store_at
 
+CARD = "# A small data set\n\n## Citation\n\nNone.\n"
 CREDENTIALS = {"aws_access_key_id": "key", "aws_secret_access_key": "secret"}
 
 
@@ -29,7 +33,7 @@ def published(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """The small data set with a card. Do not write to it."""
     path = tmp_path_factory.mktemp("published") / "small-v1"
     shutil.copytree(small_dataset, path)
-    (path / "README.md").write_text("# A small data set\n")
+    (path / "README.md").write_text(CARD)
     wt.seal(path)
     return path
 
@@ -40,7 +44,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("large") / "large-v1"
     released = wt.open("inverted-pendulum-v4-ppo-v1")
     create([str(released.runs[i].path) for i in (0, 1)], path, splits={"seed0001": "test"})
-    (path / "README.md").write_text("# Two runs of the released data\n")
+    (path / "README.md").write_text(CARD)
     wt.seal(path)
     return path
 
@@ -93,6 +97,22 @@ def bucket(
 @pytest.fixture
 def moto_bucket(moto_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bucket:
     return make_bucket(moto_url, tmp_path.name.replace("_", "-"), monkeypatch)
+
+
+@pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[stand_in.Hub]:
+    """The client reads these when it is imported; here it has been."""
+    with stand_in.running() as hub:
+        monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", hub.url)
+        template = hub.url + "/{repo_id}/resolve/{revision}/{filename}"
+        monkeypatch.setattr(huggingface_hub.constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", True)
+        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setenv("HF_TOKEN", stand_in.TOKEN)
+        monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+        store_at.cache_clear()
+        yield hub
+    store_at.cache_clear()
 
 
 def make_bucket(url: str, name: str, monkeypatch: pytest.MonkeyPatch) -> Bucket:

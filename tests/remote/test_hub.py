@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import huggingface_hub
@@ -16,6 +15,7 @@ import tipl
 import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote.conftest import files_of
+from tipl.gate import Gate
 from weighttraj.errors import RegistryError, RemoteError
 from weighttraj.format import DatasetInfo
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
@@ -23,22 +23,6 @@ from weighttraj.remote import RemotePath
 from weighttraj.remote.store import store_at
 
 GATE = "tipl-gate-inverted-pendulum-v4"
-
-
-@pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[stand_in.Hub]:
-    """The client reads these when it is imported; here it has been."""
-    with stand_in.running() as hub:
-        monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", hub.url)
-        template = hub.url + "/{repo_id}/resolve/{revision}/{filename}"
-        monkeypatch.setattr(huggingface_hub.constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
-        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DISABLE_XET", True)
-        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-        monkeypatch.setenv("HF_TOKEN", stand_in.TOKEN)
-        monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
-        store_at.cache_clear()
-        yield hub
-    store_at.cache_clear()
 
 
 def test_a_data_set_goes_there_and_back(hub: stand_in.Hub, published: Path, tmp_path: Path) -> None:
@@ -182,6 +166,10 @@ def test_a_model_of_ones_own(hub: stand_in.Hub, tmp_path: Path) -> None:
     tipl.push(model, "hf://us/mine", card=card)
     assert hub.files("models/us/mine")["README.md"] == b"# Mine\n"
     assert type(tipl.load("hf://us/mine")) is type(model)
+    gate = tipl.load(GATE)
+    assert isinstance(gate, Gate)
+    gate.push_to_hub("us/mine-too", card=card)
+    assert tipl.load("hf://us/mine-too").name == "mine-too"
 
 
 def test_code_in_a_repository_is_left_there(hub: stand_in.Hub, tmp_path: Path) -> None:

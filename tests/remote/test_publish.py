@@ -137,6 +137,9 @@ def test_what_is_not_fit_to_be_published(published: Path, tmp_path: Path) -> Non
     (bare / "README.md").unlink()
     with pytest.raises(RegistryError, match=r"(?s)with a card.*weighttraj card"):
         wt.upload(bare, address)
+    (bare / "README.md").write_text("# A card\n")
+    with pytest.raises(RegistryError, match=r"(?s)to be cited.*## Citation"):
+        wt.upload(bare, address)
     damaged = tmp_path / "damaged"
     shutil.copytree(published, damaged)
     file = damaged / "runs/seed0000.zarr.zip"
@@ -160,7 +163,7 @@ def test_what_looks_suspicious_is_held_back(published: Path, tmp_path: Path) -> 
 
     copy_packed(published / "runs/seed0000.zarr.zip", renamed, "twin")
     wt.registry.create([published / "runs/seed0000.zarr.zip", renamed], twins)
-    (twins / "README.md").write_text("# Twins\n")
+    (twins / "README.md").write_text("# Twins\n\n## Citation\n\nNone.\n")
     wt.seal(twins)
     with pytest.raises(RegistryError, match=r"(?s)looks suspicious.*--despite-lint"):
         wt.upload(twins, f"file://{tmp_path}/out")
