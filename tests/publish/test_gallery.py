@@ -102,20 +102,26 @@ def test_what_is_damaged_is_left_out(place: Path) -> None:
     assert "Data sets</h2>" not in make(place).read_text()
 
 
-def test_the_search_in_a_browser(place: Path, tmp_path: Path) -> None:
-    browser = shutil.which("chromium")
-    if browser is None:
+@pytest.fixture
+def browser(tmp_path: Path) -> list[str]:
+    """A command that prints a page as Chromium has it, in as narrow a window as it can be."""
+    program = shutil.which("chromium")
+    if program is None:
         pytest.skip("Chromium is not installed")
-    index = make(place)
     quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
-    command = [
-        *(browser, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic"),
-        *(*quiet, "--no-first-run", f"--user-data-dir={tmp_path / 'browser'}", "--dump-dom"),
+    return [
+        *(program, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", *quiet),
+        *("--no-first-run", f"--user-data-dir={tmp_path / 'browser'}", "--window-size=400,800"),
+        "--dump-dom",
     ]
+
+
+def test_the_search_in_a_browser(place: Path, browser: list[str]) -> None:
+    index = make(place)
 
     def shown(query: str) -> list[str]:
         done = subprocess.run(
-            [*command, f"file://{index}#q={query}"], capture_output=True, text=True, check=True
+            [*browser, f"file://{index}#q={query}"], capture_output=True, text=True, check=True
         )
         entries = re.findall(r"<li data-words=[^>]*?(hidden=\"\")?>\s*<h3>(.*?)</h3>", done.stdout)
         assert len(entries) == 3
@@ -125,6 +131,28 @@ def test_the_search_in_a_browser(place: Path, tmp_path: Path) -> None:
     assert shown("team%20PPO") == ["team/small"]
     assert shown("forecasts") == ["a-model"]
     assert shown("nothing") == []
+
+
+MEASURE = """<script>
+const page = document.documentElement
+document.title = page.scrollWidth + " of " + page.clientWidth
+</script>"""
+
+
+def test_no_page_is_wider_than_a_narrow_window(place: Path, browser: list[str]) -> None:
+    card = place / "cards/a-model.md"
+    wide = "| a | b |\n|---|---|\n| " + " | ".join(["`unbroken" * 20 + "`"] * 2) + " |\n"
+    card.write_text(card.read_text() + "\n" + wide + "\n```bash\n" + "long " * 100 + "\n```\n")
+    index = make(place)
+    for name in ("index", "cards/a-model", "data/small"):
+        page = index.parent / f"{name}.html"
+        allowed = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text())
+        page.write_text(allowed + MEASURE)
+        done = subprocess.run(
+            [*browser, f"file://{page}"], capture_output=True, text=True, check=True
+        )
+        (widths,) = re.findall(r"<title>(\d+) of (\d+)</title>", done.stdout)
+        assert widths[0] == widths[1] < "600", name
 
 
 def test_the_command(

@@ -347,7 +347,7 @@ def test_the_card_of_amplitudes_shows_what_chose_them(
     assert "![" not in training
     _, gate, drift, judged, _ = commands.splitlines()
     assert gate == "tipl train-gate --data small --out GATE --width 16 --horizons 1 5"
-    assert drift == "tipl train-drift --gate GATE --data small --out FOLDER --episodes 3"
+    assert drift == "tipl train-drift --along GATE --data small --out FOLDER --episodes 3"
     assert judged == metrics.results["command"]
 
 
