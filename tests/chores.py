@@ -29,7 +29,7 @@ def die_once(path: Path, _: Tell) -> str:
 
 
 def die(name: str, _: Tell) -> str:
-    if name == "mortal":
+    if "mortal" in name:
         os.kill(os.getpid(), signal.SIGKILL)
     return name
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import signal
+import sys
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -27,8 +28,9 @@ _PATIENCE = 120
 class Cluster:
     """Does tasks on a Dask cluster, see ``Engine``.
 
-    Dask does again what a worker did that died. Its workers must have one thread each, and see the
-    same files as this process.
+    Dask does again what a worker did that died. It holds all tasks that wait at a dying worker for
+    its possible killers; each that it gives up is tried once more with no other beside it. Workers
+    must have one thread each, and see the same files as this process.
 
     Args:
         address: of the scheduler, ``tcp://host:port``; or ``local``.
@@ -66,8 +68,15 @@ class Cluster:
         self.workers = max(1, len(self._client.nthreads()))
 
     def close(self) -> None:
-        """Leave the cluster, or end it if it is local."""
-        self._stack.close()
+        """Leave the cluster, or end it if it is local.
+
+        Raises:
+            KeyboardInterrupt: it was interrupted meanwhile, and is closed.
+        """
+        with noted_interrupts() as interrupted:
+            self._stack.close()
+        if interrupted.is_set() and sys.exc_info()[0] is None:
+            raise KeyboardInterrupt
 
     def run(
         self, do: Callable[[T, Tell], R], tasks: Sequence[T], note: Tell, *, wait: bool = True
@@ -77,22 +86,35 @@ class Cluster:
         told: queue.SimpleQueue[Any] = queue.SimpleQueue()
         stop = distributed.Event(topic, client=client)
         client.subscribe_topic(topic, lambda event: told.put(event[1]))
+        futures: dict[Any, T] = {}
+        suspects: list[T] = []
+
+        def submit(task: T) -> None:
+            key = f"{topic}-{uuid.uuid4()}"
+            futures[client.submit(_do, do, task, topic, key=key, pure=False, retries=RETRIES)] = (
+                task
+            )
+
         with noted_interrupts() as interrupted:
-            futures = {
-                client.submit(
-                    _do, do, task, topic, key=f"{topic}-{i}", pure=False, retries=RETRIES
-                ): task
-                for i, task in enumerate(tasks)
-            }
             try:
-                while futures:
+                for task in tasks:
+                    submit(task)
+                alone = len(futures) == 1
+                while futures or suspects:
                     if interrupted.is_set():
                         raise KeyboardInterrupt
+                    if not futures:
+                        alone = True
+                        submit(suspects.pop(0))
                     with contextlib.suppress(queue.Empty):
                         note(*told.get(timeout=_POLL))
                         continue
                     for future in [future for future in futures if future.done()]:
-                        yield futures.pop(future), _outcome(future)
+                        task, outcome = futures.pop(future), _outcome(future)
+                        if isinstance(outcome, _WorkerDiedError) and not alone:
+                            suspects.append(task)
+                        else:
+                            yield task, outcome
             finally:
                 if futures:
                     stop.set()
@@ -103,12 +125,16 @@ class Cluster:
                 client.unsubscribe_topic(topic)
 
 
+class _WorkerDiedError(EngineError):
+    """Dask gave a task up."""
+
+
 def _outcome(future: Any) -> Any:
     error = future.exception()
     if error is None:
         return future.result()
     if isinstance(error, distributed.KilledWorker):
-        return EngineError(
+        return _WorkerDiedError(
             f"its worker died, {error.allowed_failures + 1} times in a row",
             got=error,
             do="read the workers' logs; do they have enough memory and time?",
