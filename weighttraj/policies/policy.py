@@ -55,7 +55,9 @@ class Policy:
         self.layout = layout
         self.obs_norm, self.stats = obs_norm, stats
         self.weights = np.array(weights, np.float32)
-        self._layers, self._log_std = network(spec, layout, self.weights)
+        layers, self._log_std = network(spec, layout, self.weights)
+        # Matrix products give other last bits where a weight does not lie as torch aligns it.
+        self._layers = [(weight.clone(), bias.clone()) for weight, bias in layers]
 
     def with_weights(self, weights: Float32[np.ndarray, " param"]) -> Policy:
         """The same structure and normaliser with other weights, such as a forecast's."""
