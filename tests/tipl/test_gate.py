@@ -4,7 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ from tipl.gate.features import Clock, Structure, features
 from tipl.gate.forecaster import GateModelConfig
 from tipl.gate.history import History, histories
 from tipl.gate.train import relative_error
-from tipl.models.gate import GateConfig, GateNetwork
+from tipl.models.gate import GateConfig, GateNetwork, Input
 from tipl.refit import RefitConfig, refit_of
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
@@ -124,6 +124,35 @@ def test_the_structure_knows_rows_columns_and_kinds(runs: list[wt.Run]) -> None:
     assert (columns == columns[:1]).all()
     assert len(structure.row.unique()) == sum(p.shape[0] for p in layout.params)
     assert structure.kind.tolist() == [5, 0, 3, 1, 3, 2, 4]
+
+
+@pytest.mark.parametrize("name", get_args(Input))
+def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
+    runs: list[wt.Run], name: Input
+) -> None:
+    structure, clock = Structure.of(runs[0].layout), Clock.of(runs[0])
+    (_, history), *_ = list(histories(runs[0], [30], SIZES.lags, SIZES.betas))
+    whole = features(history, structure, clock, SIZES)
+    without = features(history, structure, clock, replace(SIZES, without=(name,)))
+    gone = [
+        (getattr(whole, part) != getattr(without, part)).any(0).sum()
+        for part in ("basis", "inputs", "contexts")
+    ]
+    parts = {
+        "steps": [20, 20, 0],
+        "averages": [7, 7, 0],
+        "drift": [1, 1, 0],
+        "sizes": [0, 3, 1],
+        "course": [0, 0, SIZES.course],
+        "kind": [0, 0, 6],
+        "phase": [0, 0, 1],
+        "time": [0, 0, 1],
+        "rate": [0, 0, 2],
+    }
+    assert gone == parts[name]
+    both = replace(SIZES, without=get_args(Input))
+    nothing = features(history, structure, clock, both)
+    assert not any(part.any() for part in (nothing.basis, nothing.inputs, nothing.contexts))
 
 
 # Network

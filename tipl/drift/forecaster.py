@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +68,7 @@ class Drift(Pushed):
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""
         amplitudes = {str(h): a for h, a in self.amplitudes.items()}
-        write(path, {"kind": self.kind, **asdict(self.gate.config), "amplitudes": amplitudes})
+        write(path, {"kind": self.kind, **self.gate.config.told(), "amplitudes": amplitudes})
         save_file(self.gate.network.state_dict(), Path(path) / ARRAYS)
 
     @classmethod

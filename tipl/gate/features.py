@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot, softsign
 
 from tipl.gate.history import History
-from tipl.models.gate import KINDS, LAG_COSINES, GateConfig
+from tipl.models.gate import KINDS, LAG_COSINES, GateConfig, Input
 from weighttraj import ParamLayout, Run
 
 TINY = 1e-30
@@ -129,7 +129,40 @@ def features(history: History, structure: Structure, clock: Clock, config: GateC
         ],
         dim=1,
     )
-    return Features(inputs=softsign(inputs).T, contexts=contexts, basis=basis.T)
+    inputs = softsign(inputs)
+    for name in config.without:
+        _hide(name, config, basis, inputs, contexts)
+    return Features(inputs=inputs.T, contexts=contexts, basis=basis.T)
+
+
+def _hide(
+    name: Input,
+    config: GateConfig,
+    basis: Float[Tensor, "basis param"],
+    inputs: Float[Tensor, "input param"],
+    contexts: Float[Tensor, "tensor context"],
+) -> None:
+    """Put zeros in the place of a part."""
+    averages, drift, sizes = config.lags, config.basis - 1, config.basis
+    size = config.course
+    kind = size + 1
+    phase = kind + len(KINDS)
+    time = phase + config.phases + 1
+    nothing = slice(0)
+    rows, columns = {
+        "steps": (slice(averages), nothing),
+        "averages": (slice(averages, drift), nothing),
+        "drift": (slice(drift, sizes), nothing),
+        "sizes": (slice(sizes, None), slice(size, kind)),
+        "course": (nothing, slice(size)),
+        "kind": (nothing, slice(kind, phase)),
+        "phase": (nothing, slice(phase, time)),
+        "time": (nothing, slice(time, time + 1)),
+        "rate": (nothing, slice(time + 1, None)),
+    }[name]
+    basis[rows] = 0  # its last row is the last that inputs and basis share
+    inputs[rows] = 0
+    contexts[:, columns] = 0
 
 
 Means = Callable[[Float[Tensor, "any param"]], Float[Tensor, "any group"]]

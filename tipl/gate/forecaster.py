@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,6 +34,13 @@ class GateModelConfig:
     """Sizes of the network."""
     every: int | None
     """Gradient steps from one snapshot to the next in the training runs."""
+
+    def told(self) -> dict[str, Any]:
+        """What is written: nothing of inputs that are left out where none is."""
+        found = asdict(self)
+        if not self.network.without:
+            del found["network"]["without"]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +118,7 @@ class Gate(Pushed):
 
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""
-        write(path, {"kind": self.kind, **asdict(self.config)})
+        write(path, {"kind": self.kind, **self.config.told()})
         save_file(self.network.state_dict(), Path(path) / ARRAYS)
 
     @classmethod

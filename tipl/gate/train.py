@@ -16,7 +16,7 @@ from tipl.baselines.horizons import fitted
 from tipl.gate.examples import GateExamples, gather
 from tipl.gate.forecaster import Gate, GateModelConfig
 from tipl.learn import LearnConfig, Learner, Tell, cadence_of, learn
-from tipl.models.gate import GateConfig, GateNetwork
+from tipl.models.gate import GateConfig, GateNetwork, Input
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +29,8 @@ class GateTrainConfig(LearnConfig):
     """Units of its hidden layers."""
     experts: int = 8
     """Linear filters that it mixes."""
+    without: tuple[Input, ...] = ()
+    """Zeros instead of these inputs, to learn what they are worth."""
 
 
 def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
@@ -54,6 +56,7 @@ class _GateLearner(Learner[GateExamples]):
             lags=config.lags,
             width=config.width,
             experts=config.experts,
+            without=config.without,
         )
         self._train, self._model = config, GateModelConfig(network=sizes, every=every)
         self.network = GateNetwork(sizes)

@@ -11,6 +11,7 @@ written for each tensor. Ours.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -21,6 +22,15 @@ KINDS = ("input weight", "hidden weight", "output weight", "hidden bias", "outpu
 """What a tensor is in a policy."""
 LAG_COSINES = 10
 """Earlier steps that the last step is compared with."""
+
+Input = Literal["steps", "averages", "drift", "sizes", "course", "kind", "phase", "time", "rate"]
+"""A part of what the network sees.
+
+``steps``, ``averages`` and ``drift`` are the basis of its filters; ``sizes``: how large the steps
+of a parameter, its row, its column and its tensor are beside each other's; ``course``: how straight
+its tensor and the whole policy go; ``rate``: of learning; the others are of the tensor and of the
+snapshot.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +49,8 @@ class GateConfig:
     """Units of a hidden layer."""
     experts: int = 12
     """Linear filters that are mixed."""
+    without: tuple[Input, ...] = ()
+    """Zeros instead of these, to learn what they are worth."""
 
     @property
     def basis(self) -> int:
@@ -53,9 +65,13 @@ class GateConfig:
     @property
     def contexts(self) -> int:
         """Numbers of a tensor: of itself and of the whole policy, its kind, phase and time."""
+        return self.course + 1 + len(KINDS) + (self.phases + 1) + 3
+
+    @property
+    def course(self) -> int:
+        """Of these, how straight the tensor and the policy go."""
         averages = len(self.betas)
-        of_steps = LAG_COSINES + 3 * averages + max(0, averages - 3) + 2
-        return 2 * of_steps + 1 + len(KINDS) + (self.phases + 1) + 3
+        return 2 * (LAG_COSINES + 3 * averages + max(0, averages - 3) + 2)
 
 
 class GateNetwork(nn.Module):
@@ -152,4 +168,4 @@ def _basis_scale(config: GateConfig) -> Float[Tensor, "basis horizon"]:
     return torch.tensor([*steps, *averages, [float(h) for h in config.horizons]])
 
 
-__all__ = ["KINDS", "LAG_COSINES", "GateConfig", "GateNetwork"]
+__all__ = ["KINDS", "LAG_COSINES", "GateConfig", "GateNetwork", "Input"]
