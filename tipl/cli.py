@@ -26,6 +26,7 @@ try:
     from tipl.drift import DriftConfig, train_drift
     from tipl.evaluation import EvaluateConfig
     from tipl.gate import GateTrainConfig, train_gate
+    from tipl.prepare import digest_of
     from tipl.refit import check_model
     from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
@@ -92,17 +93,25 @@ def _fit(
 ) -> None:
     """Fit the ladder of baselines to the training runs of a data set; minutes on one core."""
     dataset = wt.open_dataset(data)
+    train = dataset.split("train").runs
     validation = [run for run in dataset if run.split == "validation"]
     with console.status("reading") as status:
         ladder = tipl.fit_ladder(
-            dataset.split("train").runs,
+            train,
             validation,
             horizons=horizons,
             seed=seed,
             progress=status.update,
             training=TrainingConfig(steps=steps),
         )
-    tipl.save_ladder(ladder, out)
+    settings = {
+        "data": data,
+        "runs": {run.id: digest_of(run) for run in train},
+        "seed": seed,
+        "horizons": horizons,
+        "steps": steps,
+    }
+    tipl.save_ladder(ladder, out, settings)
     print(f"{len(ladder)} baselines in {out}: {' '.join(f.name for f in ladder)}")
 
 

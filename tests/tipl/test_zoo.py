@@ -61,6 +61,9 @@ def test_fitted_baselines_are_loaded_by_folder(
     names = {path.name for path in tmp_path.iterdir()}
     assert {"persistence", "ar-20-phase", "wnn"} < names
     assert all(load(tmp_path / name).name == name and name in said for name in names)
+    settings = json.loads((tmp_path / "wnn/train.json").read_text())
+    assert (settings["horizons"], settings["steps"]) == ([1, 5, 20], 20)
+    assert list(settings["runs"]) == [run.id for run in wt.open(small_dataset).split("train")]
 
 
 def test_a_name_that_nobody_has_is_refused() -> None:

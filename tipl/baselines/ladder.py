@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tipl.baselines.endpoints import EndPoints
 from tipl.baselines.features import Features
@@ -111,10 +113,23 @@ def fit_ladder(
     return ladder
 
 
-def save_ladder(forecasters: Iterable[Forecaster], folder: str | Path) -> None:
-    """Write each forecaster into a folder of its name."""
+def save_ladder(
+    forecasters: Iterable[Forecaster],
+    folder: str | Path,
+    settings: Mapping[str, Any] | None = None,
+) -> None:
+    """Write each forecaster into a folder of its name.
+
+    Args:
+        forecasters: fitted ones.
+        folder: of all.
+        settings: how they were fitted, and to what, for ``train.json``; None: not told.
+    """
     for forecaster in forecasters:
-        forecaster.save(Path(folder) / forecaster.name)
+        out = Path(folder) / forecaster.name
+        forecaster.save(out)
+        if settings is not None:
+            (out / "train.json").write_text(json.dumps(settings, indent=1))
 
 
 __all__ = ["by_name", "fit_ladder", "names", "save_ladder"]

@@ -254,7 +254,7 @@ def _training(metrics: Metrics) -> str:
 
 def _settings(metrics: Metrics) -> dict[str, dict[str, Any]]:
     """Of the training, and of that of the network before it."""
-    own = dict(metrics.settings)
+    own = {key: value for key, value in metrics.settings.items() if value != []}
     before = own.pop("of_gate", {})
     return {" of the network": before, " of the amplitudes": own} if before else {"": own}
 
@@ -310,6 +310,8 @@ def _commands(metrics: Metrics) -> str:
         ]
     elif metrics.trained_on and metrics.kind in _COMMANDS:
         commands.append(f"tipl {_COMMANDS[metrics.kind]} --data {data} --out FOLDER {given['']}")
+    elif metrics.trained_on:
+        commands.append(f"tipl fit {data} --out FOLDER {given['']}")
     return "\n".join(["```bash", *commands, metrics.results["command"], "```"])
 
 
