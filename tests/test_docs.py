@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import importlib
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
 import tipl
 import weighttraj as wt
-from tests.pages import QUICKER, run_page
+from tests.pages import QUICKER, blocks, run_command, run_page
 
 DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
 
 
-@pytest.mark.parametrize("name", ["final_normalizer"])
+@pytest.mark.parametrize("name", ["final_normalizer", "one_jump"])
 def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(STUDIES))
     study = importlib.import_module(name)
     page = study.PAGE.read_text()
     assert study.insert(page) == page, f"the page is stale: run python docs/studies/{name}.py"
-    stale = page.replace("snapshot's own normaliser,", "final normaliser,")
+    stale = page.replace("|---|", "|---:|")
     assert study.insert(stale) == page != stale
 
 
@@ -68,6 +74,39 @@ def test_train(reader: Path) -> None:
     run_page(DOCS / "train.md", shorter)
     for name in ("tipl", "tipl-2", "tipl-python", "tipl-gate", "tipl-drift", "tipl-causal"):
         assert tipl.load(f"data/demo/{name}").name == name
+
+
+def test_clusters_by_hand(reader: Path) -> None:
+    """But for SLURM, which would have to be installed."""
+    (_, text), *_ = blocks(DOCS / "clusters.md")
+    for long, short in {
+        "inverted-pendulum-v4-ppo-v1": "demo",
+        "--nworkers 8": "--nworkers 1",
+    }.items():
+        assert long in text
+        text = text.replace(long, short)
+    scheduler, worker, collect = (line.partition("#")[0] for line in text.splitlines())
+    with ExitStack() as stack:
+        begun = stack.enter_context(background(f"{scheduler} --host 127.0.0.1 --port 0"))
+        assert begun.stderr is not None
+        address = next(filter(None, (re.search(r"tcp://[\d.:]+", line) for line in begun.stderr)))[
+            0
+        ]
+        stack.enter_context(background(worker.replace("tcp://host:8786", address)))
+        run_command(f"{collect.replace('tcp://host:8786', address)} --out data/clusters")
+    assert wt.verify("data/clusters") == []
+
+
+@contextmanager
+def background(command: str) -> Iterator[subprocess.Popen[str]]:
+    """A server, for a while."""
+    program, *arguments = shlex.split(command)
+    path = Path(sys.executable).with_name(program)
+    with subprocess.Popen([path, *arguments], stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
 
 
 @pytest.mark.timeout(300)

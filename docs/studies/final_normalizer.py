@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from page import insert as insert_into
 from rich.progress import track
 
 import weighttraj as wt
@@ -25,7 +26,6 @@ from weighttraj.policies import Evaluator, env_of, load_policies
 
 HERE = Path(__file__)
 RESULTS, PAGE, PICTURE = (HERE.with_suffix(suffix) for suffix in (".json", ".md", ".svg"))
-START, END = "<!-- table: written by final_normalizer.py -->", "<!-- end of the table -->"
 MODES = {"deterministic": True, "sampled": False}
 STAGES = ((0.0, 0.02), (0.02, 0.1), (0.1, 0.3), (0.3, 1.0))
 """Parts of the recorded training, as shares of its environment steps."""
@@ -149,9 +149,7 @@ def draw(results: dict[str, Any]) -> None:
 
 def insert(page: str) -> str:
     """The page with the table as the results have it."""
-    before, rest = page.split(START)
-    _, after = rest.split(END)
-    return f"{before}{START}\n\n{table(json.loads(RESULTS.read_text()))}\n\n{END}{after}"
+    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
 
 
 def main() -> None:
