@@ -8,18 +8,14 @@ import pytest
 import torch
 
 import weighttraj as wt
+from tests.tipl.lively import CAUSAL, HORIZONS, lively_causal
 from tipl.causal import Causal, CausalTrainConfig, train_causal
 from tipl.causal.forecaster import CausalModelConfig
 from tipl.causal.train import _CausalLearner
-from tipl.checks import NULL, TOLERANCE, causality, equivariance, random_walks, scale, skills
+from tipl.checks import NULL, random_walks, skills
 from tipl.errors import ForecastError, ModelError, RepresentationError, TrainError
-from tipl.models.causal import CausalConfig, CausalGPT
+from tipl.models.causal import CausalGPT
 from tipl.refit import RefitConfig, refit_of
-
-HORIZONS = (1, 2, 5)
-SIZES = CausalConfig(
-    horizons=HORIZONS, rank=3, window=30, block_size=6, phases=4, n_layer=1, n_head=2, n_embd=16
-)
 
 
 @pytest.fixture(scope="module")
@@ -56,30 +52,22 @@ def unseen(config: CausalTrainConfig) -> wt.Run:
     return wt.open_dataset(config.data[0]).split("test").runs[0]
 
 
-def lively() -> Causal:
-    """A network whose forecasts are no copies, as its head is drawn."""
-    torch.manual_seed(0)
-    network = CausalGPT(SIZES)
-    torch.nn.init.normal_(network.head.weight, std=0.1)
-    return Causal(network, CausalModelConfig(network=SIZES, every=2))
-
-
 def test_before_training_it_is_persistence(runs: list[wt.Run]) -> None:
-    model = Causal(CausalGPT(SIZES), CausalModelConfig(network=SIZES, every=2))
+    model = Causal(CausalGPT(CAUSAL), CausalModelConfig(network=CAUSAL, every=2))
     forecast = model.forecast(runs[0], [0, 20], [1, 5])
     assert np.array_equal(forecast, np.repeat(runs[0].weights[[0, 20]][:, None], 2, axis=1))
 
 
 def test_it_moves_within_the_directions_of_the_path(runs: list[wt.Run]) -> None:
     weights = runs[0].weights[:].astype(np.float64)
-    moved = lively().forecast(runs[0], [25], [1, 2, 5])[0] - weights[25]
+    moved = lively_causal().forecast(runs[0], [25], [1, 2, 5])[0] - weights[25]
     path = np.linalg.svd(weights[:26] - weights[25], full_matrices=False)[2][:3]
     assert np.linalg.norm(moved) > 1e-4
     np.testing.assert_allclose(moved @ path.T @ path, moved, atol=1e-6)
 
 
 def test_early_starts_are_copied(runs: list[wt.Run]) -> None:
-    forecast = lively().forecast(runs[0], [2, 3], [1])
+    forecast = lively_causal().forecast(runs[0], [2, 3], [1])
     assert np.array_equal(forecast[0, 0], runs[0].weights[2])
     assert not np.array_equal(forecast[1, 0], runs[0].weights[3])
 
@@ -101,20 +89,6 @@ def test_the_error_that_is_learnt_is_that_of_the_weights(
                 ratios.append((error**2).sum() / ((weights[t + h] - weights[t]) ** 2).sum())
     with torch.no_grad():
         assert learner.error(examples).item() == pytest.approx(np.mean(ratios), rel=1e-3)
-
-
-def test_it_is_causal(runs: list[wt.Run], tmp_path: Path) -> None:
-    assert causality(lively(), runs[0], tmp_path, 20, HORIZONS)
-
-
-@pytest.mark.parametrize("symmetry", ["permutation", "sign"])
-def test_it_follows_symmetries(symmetry: str, runs: list[wt.Run], tmp_path: Path) -> None:
-    error = equivariance(lively(), runs[0], tmp_path, [9, 40], HORIZONS, symmetry=symmetry)
-    assert error < TOLERANCE
-
-
-def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
-    assert scale(lively(), runs[0], tmp_path, [9, 40], HORIZONS) < TOLERANCE
 
 
 def test_it_finds_nothing_in_random_walks(

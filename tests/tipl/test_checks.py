@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import weighttraj as wt
+from tests.tipl.lively import HORIZONS as SOME
+from tests.tipl.lively import lively_causal, lively_gate
 from tipl import TIPL, Persistence, Reconstruction
 from tipl.baselines import (
     DMD,
@@ -25,6 +27,7 @@ from tipl.baselines import (
 )
 from tipl.checks import (
     NULL,
+    TOLERANCE,
     Fit,
     causality,
     check,
@@ -36,7 +39,8 @@ from tipl.checks import (
     scale,
     skills,
 )
-from tipl.forecast import TIPLConfig
+from tipl.drift import Drift
+from tipl.forecast import Forecaster, TIPLConfig
 from tipl.models.gpt import GPT, GPTConfig
 from tipl.refit import RefitConfig, refit_of
 from weighttraj.policies import load_policies
@@ -109,6 +113,19 @@ def test_baselines_with_a_fit(fit: Fit, fails: set[str], runs: list[wt.Run], fol
     refit = refit_of(fitted, RefitConfig(folder=folder, horizons=HORIZONS, batches=STEPS))
     found = check(fitted, runs[0], folder, fit=refit, horizons=HORIZONS)
     assert {name for name, passed in found.passed.items() if not passed} == fails, found
+
+
+NETWORKS = [lively_gate(), lively_causal(), Drift(lively_gate(), {1: 4.0, 2: 2.0, 5: 1.5})]
+
+
+@pytest.mark.parametrize("forecaster", NETWORKS, ids=label)
+def test_networks(forecaster: Forecaster, runs: list[wt.Run], tmp_path: Path) -> None:
+    """But for random walks, for which they are trained, in tests of their own."""
+    where = (forecaster, runs[0], tmp_path)
+    assert causality(*where, 20, SOME)
+    for symmetry in ("permutation", "sign"):
+        assert equivariance(*where, [9, 40], SOME, symmetry=symmetry) < TOLERANCE
+    assert scale(*where, [9, 40], SOME) < TOLERANCE
 
 
 def test_what_has_no_fit_is_not_refitted(folder: Path) -> None:

@@ -11,17 +11,14 @@ import pytest
 import torch
 
 import weighttraj as wt
+from tests.tipl.lively import GATE, HORIZONS, lively_gate
 from tipl import learn as learning
 from tipl.baselines import Ema
 from tipl.baselines.trajectory import Trajectory
 from tipl.checks import (
     NULL,
-    TOLERANCE,
-    causality,
-    equivariance,
     random_walks,
     run_like,
-    scale,
     skills,
 )
 from tipl.errors import ForecastError, ModelError, TrainError
@@ -31,12 +28,9 @@ from tipl.gate.features import Clock, Structure, features
 from tipl.gate.forecaster import GateModelConfig
 from tipl.gate.history import History, histories
 from tipl.gate.train import relative_error
-from tipl.models.gate import GateConfig, GateNetwork, Input
+from tipl.models.gate import GateNetwork, Input
 from tipl.refit import RefitConfig, refit_of
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
-
-HORIZONS = (1, 2, 5)
-SIZES = GateConfig(horizons=HORIZONS, phases=4, width=16, experts=3)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +48,8 @@ def config(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Gat
         n_batches=60,
         batch_size=8,
         validate_every=20,
-        width=SIZES.width,
-        experts=SIZES.experts,
+        width=GATE.width,
+        experts=GATE.experts,
     )
 
 
@@ -66,15 +60,6 @@ def trained(config: GateTrainConfig) -> Gate:
 
 def unseen(config: GateTrainConfig) -> wt.Run:
     return wt.open_dataset(config.data[0]).split("test").runs[0]
-
-
-def lively(seed: int = 0) -> Gate:
-    """A network whose forecasts are no copies, as all its parameters are drawn."""
-    torch.manual_seed(seed)
-    network = GateNetwork(SIZES)
-    for parameter in network.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    return Gate(network, GateModelConfig(network=SIZES, every=2))
 
 
 # History and features
@@ -104,11 +89,11 @@ def test_a_walk_that_goes_on_is_the_walk_from_the_beginning(runs: list[wt.Run]) 
 
 def test_features_of_a_run_that_has_not_moved_are_finite(runs: list[wt.Run]) -> None:
     structure, clock = Structure.of(runs[0].layout), Clock.of(runs[0])
-    history = History(runs[0].weights[0], SIZES.lags, SIZES.betas)
+    history = History(runs[0].weights[0], GATE.lags, GATE.betas)
     for _ in range(2):
-        seen = features(history, structure, clock, SIZES)
-        assert seen.inputs.shape == (122, SIZES.inputs)
-        assert seen.contexts.shape == (7, SIZES.contexts)
+        seen = features(history, structure, clock, GATE)
+        assert seen.inputs.shape == (122, GATE.inputs)
+        assert seen.contexts.shape == (7, GATE.contexts)
         assert torch.isfinite(seen.inputs).all()
         assert torch.isfinite(seen.contexts).all()
         history.push(runs[0].weights[0])
@@ -131,9 +116,9 @@ def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
     runs: list[wt.Run], name: Input
 ) -> None:
     structure, clock = Structure.of(runs[0].layout), Clock.of(runs[0])
-    (_, history), *_ = list(histories(runs[0], [30], SIZES.lags, SIZES.betas))
-    whole = features(history, structure, clock, SIZES)
-    without = features(history, structure, clock, replace(SIZES, without=(name,)))
+    (_, history), *_ = list(histories(runs[0], [30], GATE.lags, GATE.betas))
+    whole = features(history, structure, clock, GATE)
+    without = features(history, structure, clock, replace(GATE, without=(name,)))
     gone = [
         (getattr(whole, part) != getattr(without, part)).any(0).sum()
         for part in ("basis", "inputs", "contexts")
@@ -143,14 +128,14 @@ def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
         "averages": [7, 7, 0],
         "drift": [1, 1, 0],
         "sizes": [0, 3, 1],
-        "course": [0, 0, SIZES.course],
+        "course": [0, 0, GATE.course],
         "kind": [0, 0, 6],
         "phase": [0, 0, 1],
         "time": [0, 0, 1],
         "rate": [0, 0, 2],
     }
     assert gone == parts[name]
-    both = replace(SIZES, without=get_args(Input))
+    both = replace(GATE, without=get_args(Input))
     nothing = features(history, structure, clock, both)
     assert not any(part.any() for part in (nothing.basis, nothing.inputs, nothing.contexts))
 
@@ -159,37 +144,20 @@ def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
 
 
 def test_before_training_it_is_persistence(runs: list[wt.Run]) -> None:
-    gate = Gate(GateNetwork(SIZES), GateModelConfig(network=SIZES, every=2))
+    gate = Gate(GateNetwork(GATE), GateModelConfig(network=GATE, every=2))
     forecast = gate.forecast(runs[0], [0, 20], [1, 5])
     assert np.array_equal(forecast, np.repeat(runs[0].weights[[0, 20]][:, None], 2, axis=1))
 
 
 def test_one_tensor_after_the_other_is_the_whole(runs: list[wt.Run]) -> None:
-    gate, structure, clock = lively(), Structure.of(runs[0].layout), Clock.of(runs[0])
-    for _, history in histories(runs[0], [17], SIZES.lags, SIZES.betas):
-        seen = features(history, structure, clock, SIZES)
+    gate, structure, clock = lively_gate(), Structure.of(runs[0].layout), Clock.of(runs[0])
+    for _, history in histories(runs[0], [17], GATE.lags, GATE.betas):
+        seen = features(history, structure, clock, GATE)
     with torch.no_grad():
         whole = gate.network(seen.inputs, seen.contexts, seen.basis, structure.tensor)
         parts = gate.displacements(seen, structure, [2, 0])
     assert whole.abs().max() > 1e-4
     torch.testing.assert_close(parts, whole.T[[2, 0]], rtol=1e-4, atol=1e-8)
-
-
-# The tests of a causal forecaster
-
-
-def test_it_is_causal(runs: list[wt.Run], tmp_path: Path) -> None:
-    assert causality(lively(), runs[0], tmp_path, 20, HORIZONS)
-
-
-@pytest.mark.parametrize("symmetry", ["permutation", "sign"])
-def test_it_follows_symmetries(symmetry: str, runs: list[wt.Run], tmp_path: Path) -> None:
-    error = equivariance(lively(), runs[0], tmp_path, [9, 40], HORIZONS, symmetry=symmetry)
-    assert error < TOLERANCE
-
-
-def test_it_follows_the_scale(runs: list[wt.Run], tmp_path: Path) -> None:
-    assert scale(lively(), runs[0], tmp_path, [9, 40], HORIZONS) < TOLERANCE
 
 
 def test_it_finds_nothing_in_random_walks(
@@ -217,7 +185,7 @@ def test_one_network_serves_policies_of_any_size(tmp_path: Path) -> None:
         rng = np.random.default_rng(0)
         for t in range(20):
             writer.append(rng.normal(size=30).astype(np.float32), num_timesteps=t)
-    gate = replace(lively(), config=GateModelConfig(network=SIZES, every=None))
+    gate = replace(lively_gate(), config=GateModelConfig(network=GATE, every=None))
     forecast = gate.forecast(wt.open_run(tmp_path / "wide.zarr"), [0, 9], HORIZONS)
     assert forecast.shape == (2, 3, 30)
 
@@ -226,11 +194,11 @@ def test_one_network_serves_policies_of_any_size(tmp_path: Path) -> None:
 
 
 def test_examples_are_what_forecasts_see(runs: list[wt.Run]) -> None:
-    examples = gather([runs], SIZES, starts=2000, seed=0)  # so many draws find every start
+    examples = gather([runs], GATE, starts=2000, seed=0)  # so many draws find every start
     assert len(examples) == sum(len(run) - 2 for run in runs)
-    assert examples.inputs.shape[1:] == (PARAMS, SIZES.inputs)
+    assert examples.inputs.shape[1:] == (PARAMS, GATE.inputs)
     assert examples.weight.sum(1).numpy() == pytest.approx(np.ones(len(examples)), rel=1e-3)
-    gate = lively()
+    gate = lively_gate()
     skill = 1 - relative_error(gate.network, examples).item()
     # The same of the forecasts.
     ratios = []
