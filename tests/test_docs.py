@@ -42,6 +42,9 @@ def test_bring_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "pendulum": ("", 18),
         "checkpoints": ("test", 4),
     }
+    run = made["cartpole"]
+    assert run.phase.tolist() == [-1, *[0, 1, 2, 3] * 8]
+    assert run["index/epoch"][:].tolist() == [-1, *[1, 2, 3, 4] * 8]
     before, after = names["returns"].returns.mean(1)
     assert after > before
 

@@ -91,6 +91,9 @@ def check(
         horizons: how far to look.
         count: random walks for the null; two are forecast, the others are for the fit.
         seed: of walks and symmetries.
+
+    Raises:
+        ForecastError: it makes no forecast of such runs, or for such horizons.
     """
     walks = random_walks(run, folder, count=count, seed=seed)
     walker = forecaster if fit is None else fit(walks[2:])

@@ -45,7 +45,16 @@ class Forecaster(Protocol):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Forecasts of phi_{t+h} for each start t and horizon h, from phi_0, ..., phi_t."""
+        """Forecasts of phi_{t+h} for each start t and horizon h, from phi_0, ..., phi_t.
+
+        Args:
+            run: whose weights they are.
+            starts: rows of ``run.weights``, from 0, in any order.
+            horizons: snapshots ahead, from 1.
+
+        Raises:
+            ForecastError: it makes no such forecast, or of no such run.
+        """
         ...
 
     def save(self, path: str | Path) -> None:

@@ -60,7 +60,7 @@ class LearnConfig:
 
     data: tuple[str | Path, ...]
     """Data sets: paths or ids. The training split of each is learnt from, in equal shares; the
-    runs of its validation split choose when to stop."""
+    runs of its validation split choose which state is kept."""
     out: Path
     """Folder of the model. A training that stopped goes on where it was saved last."""
     horizons: tuple[int, ...] = HORIZONS

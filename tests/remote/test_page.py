@@ -37,11 +37,10 @@ def test_publish_and_load(
         if address:
             wt.upload(path, address + name)
             shutil.rmtree(path)
-    published = f"{reader}/published"
-    names = run_page(ROOT / "docs/publish.md", {"/tmp/weighttraj-published": published})  # noqa: S108
+    names = run_page(ROOT / "docs/publish.md")
     assert names["window"].shape == (20, 122)
     assert len(names["copy"]) == 5
     assert [len(run) for run in names["part"]] == [241, 241]
-    assert wt.verify(Path(published) / "inverted-pendulum-v4-ppo-v1") == []
+    assert wt.verify("data/demo/published/inverted-pendulum-v4-ppo-v1") == []
     assert len(wt.open("hf://organisation/my-data-v1")) == 5
     assert tipl.load("hf://organisation/gate").causal

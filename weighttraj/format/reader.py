@@ -304,8 +304,12 @@ class Run:
     def load_policy(self, t: int = -1) -> Policy:
         """The policy of snapshot t, which acts as the agent did. Needs the extra ``sb3``.
 
+        Args:
+            t: snapshot, from 0; below 0 it counts from the end.
+
         Raises:
             PolicyError: the run's policy cannot be rebuilt; the message says why.
+            IndexError: there is no such snapshot.
         """
         from weighttraj.policies.policy import load_policy
 
@@ -437,8 +441,9 @@ def open_dataset(
 ) -> Dataset:
     """Open a data set: a folder, one HDF5 file (``.h5``), an id, or an address.
 
-    Ids are looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH`` and in those of a clone. A
-    data set that is still being collected opens too, with the runs that exist so far.
+    Ids are looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH`` (where it names none, in
+    ``~/.weighttraj/datasets``) and in those of a clone. A data set that is still being collected
+    opens too, with the runs that exist so far.
 
     At an address (``hf://org/name``, ``s3://``, ``gs://``, ``az://``, ``https://``, ``file://``)
     nothing is downloaded but what is read: the list of runs now, then parts of runs. HDF5 files

@@ -112,8 +112,9 @@ class RunWriter:
             gradient_step: optimizer steps so far; -1: not said.
             phase: which part of the iteration ends here, from 0; -1: none, or not said.
             learning_rate: of the gradient step that led here.
-            obs_norm: statistics of the observation normaliser; required if ``info.obs_norm``.
-            ret_norm: statistics of the reward normaliser; required if ``info.ret_norm``.
+            obs_norm: (mean, var, count) of the observation normaliser, float64 of an observation's
+                shape and a number; required if ``info.obs_norm``.
+            ret_norm: the same of the reward normaliser, scalars; required if ``info.ret_norm``.
             train: diagnostics known at this moment; NaN is stored for those left out.
             critic: critic's parameters; required if ``info.critic_layout``.
             moments: Adam's first and second moments; required if ``info.optimizer_moments``.

@@ -237,6 +237,7 @@ def evaluate(
         threads: for physics and networks.
 
     Raises:
+        CollectError: the environment is not registered here.
         PolicyError: the run does not say which environment it was trained in.
     """
     if isinstance(env, Run):
