@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
@@ -28,6 +29,7 @@ try:
     from tipl.gate import GateTrainConfig, train_gate
     from tipl.prepare import digest_of
     from tipl.refit import check_model
+    from tipl.report import tables
     from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
     from tipl.zoo.card import HEADLINE, listed, write_card
@@ -253,15 +255,28 @@ def _report(
 
 
 def _table(results: dict[str, Any]) -> Table:
+    """The overview; where there is no room, without intervals, and with fewer columns."""
     (overview,) = headline(results)
+    shown = range(len(overview.columns))
+    table = _overview(results, overview, shown, interval=console.width >= _WIDE)
+    anything = console.options.update_width(1_000)  # else it measures what the console has
+    if console.measure(table, options=anything).minimum > console.width:
+        few = [i for i in shown if overview.columns[i].startswith(("skill", "gain"))]
+        table = _overview(results, overview, few, interval=False)
+        table.caption = "the report has more columns, and intervals"
+    return table
+
+
+def _overview(
+    results: dict[str, Any], overview: tables.Table, shown: Iterable[int], *, interval: bool
+) -> Table:
     table = Table(title=f"{results['data']}, {results['split']} runs: {', '.join(results['runs'])}")
     table.add_column("forecaster", no_wrap=True)
-    for column in overview.columns:
-        table.add_column(column, justify="right")
+    for i in shown:
+        table.add_column(overview.columns[i], justify="right")
     for name, cells in overview.rows:
-        # Intervals where there is room; the report has them all.
-        shown = (cell(row, interval=console.width >= _WIDE) for row in cells)
-        table.add_row(report.label(name), *(escape(text) for text in shown))
+        texts = (cell(cells[i], interval=interval) for i in shown)
+        table.add_row(report.label(name), *(escape(text) for text in texts))
     return table
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from tipl import cli
 from tipl.errors import EvaluateError
 from tipl.report import insert_markdown
 from tipl.report.figures import OTHERS, figures, skill_figure, styles, titles
@@ -35,6 +37,24 @@ def demo() -> dict[str, Any]:
 def shown(results: dict[str, Any], path: Sequence[str], h: int) -> str:
     """A figure of TIPL as text."""
     return cell(row_at(results["forecasters"]["tipl"], path, h))
+
+
+@pytest.mark.parametrize("width", [80, 100, 250])
+def test_the_overview_cuts_nothing_off(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a terminal, with the long names of the zoo."""
+    results = json.loads((ROOT / "docs/results/inverted-pendulum-v4-ppo-v1.json").read_text())
+    monkeypatch.setattr(cli, "console", Console(width=width))
+    cli.console.print(cli._table(results))
+    said = capsys.readouterr().out
+    assert "…" not in said
+    assert max(map(len, said.splitlines())) <= width
+    gate = next(line for line in said.splitlines() if "tipl-gate-" in line)
+    rows = results["forecasters"]["tipl-gate-inverted-pendulum-v4"]
+    for path, h in ((SKILL, 1), (SKILL, 50), (GAIN, 50)):
+        assert cell(row_at(rows, path, h), interval=width == 250) in gate
+    assert ("the report has more columns" in said) == (width < 120)
 
 
 def shifted(found: Any, by: float) -> Any:
