@@ -21,7 +21,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
 
 
-@pytest.mark.parametrize("name", ["final_normalizer", "gate_inputs", "one_jump", "trained_again"])
+@pytest.mark.parametrize("name", sorted(path.stem for path in STUDIES.glob("*.md")))
 def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(STUDIES))
     study = importlib.import_module(name)
