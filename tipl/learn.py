@@ -185,7 +185,7 @@ class _Training(Generic[E]):
         }
         torch.manual_seed(config.seed)
         self._learner = build([run for group in self._train for run in group])
-        keep_settings(config.out, settings, MAY_DIFFER)
+        keep_settings(config.out, settings, MAY_DIFFER, config)
         self._optimizer = torch.optim.AdamW(
             self._learner.network.parameters(), weight_decay=config.weight_decay
         )

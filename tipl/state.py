@@ -16,25 +16,30 @@ from torch import Tensor, nn
 from tipl.errors import TrainError
 
 
-def keep_settings(out: Path, settings: dict[str, Any], may_differ: Collection[str]) -> None:
+def keep_settings(
+    out: Path, settings: dict[str, Any], may_differ: Collection[str], config: object = None
+) -> None:
     """Keep the settings beside the model, and refuse to go on with others.
 
     Args:
         out: folder of the model; made if it is not there.
         settings: what JSON can hold.
         may_differ: settings that can change from one start to the next.
+        config: the dataclass that they come from. A training that began before one of its settings
+            existed did what the default now does.
 
     Raises:
         TrainError: the folder holds a training with other settings.
     """
     file, settings = out / "train.json", json.loads(json.dumps(settings))
     if file.exists():
-        old = json.loads(file.read_text())
-        other = {k: v for k, v in settings.items() if old.get(k) != v and k not in may_differ}
+        known = {k: getattr(type(config), k, None) for k in settings}
+        old = json.loads(json.dumps(known, default=str)) | json.loads(file.read_text())
+        other = {k: v for k, v in settings.items() if old[k] != v and k not in may_differ}
         if other:
             raise TrainError(
                 "the folder holds a training with other settings or data",
-                expected={k: old.get(k) for k in other},
+                expected={k: old[k] for k in other},
                 got=other,
                 where=out,
                 do="choose another --out, or delete the folder",

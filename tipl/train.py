@@ -186,7 +186,7 @@ def _model(config: TrainConfig, gpt: GPTConfig, sampler: TokenSampler) -> GPT:
 def _open_folder(config: TrainConfig, prepared: Prepared) -> dict[str, Tensor]:
     """Check the folder and make it ready; returns the state to go on from, or nothing."""
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()}
-    keep_settings(config.out, plain | {"runs": prepared.digests}, MAY_DIFFER)
+    keep_settings(config.out, plain | {"runs": prepared.digests}, MAY_DIFFER, config)
     state = read_state(config.out)
     start = int(state["n"]) if state else 0
     if start > config.n_batches:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,19 @@ def test_settings_are_kept_and_others_refused(tmp_path: Path) -> None:
     assert json.loads((out / "train.json").read_text()) == {"rank": 3, "device": "cuda"}
     with pytest.raises(TrainError, match=r"expected: {'rank': 3}\n  got: {'rank': 4}"):
         keep_settings(out, {"rank": 4, "device": "cpu"}, ("device",))
+
+
+def test_a_setting_that_came_later_is_what_it_is_by_default(tmp_path: Path) -> None:
+    @dataclass
+    class Settings:
+        rank: int
+        sees: tuple[str, ...] = ()
+
+    keep_settings(tmp_path, {"rank": 3}, ())
+    keep_settings(tmp_path, asdict(Settings(3)), (), Settings(3))
+    (tmp_path / "train.json").write_text('{"rank": 3}')
+    with pytest.raises(TrainError, match=r"expected: {'sees': \[\]}\n  got: {'sees': \['all'\]}"):
+        keep_settings(tmp_path, asdict(Settings(3, ("all",))), (), Settings(3, ("all",)))
 
 
 def test_the_log_is_cut_to_what_was_saved(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift
         "out": str(config.out),
         **_trained_on(Path(config.along)),
     }
-    keep_settings(config.out, settings, ("out", "data", "chosen_on", "of_gate"))
+    keep_settings(config.out, settings, ("out", "data", "chosen_on", "of_gate"), config)
     parts, factors = Parts(config.out / "parts"), tuple(sorted(config.amplitudes))
     console = console or Console(quiet=True)
     columns = (
