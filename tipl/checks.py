@@ -30,6 +30,9 @@ from weighttraj import ParamLayout, Run, RunWriter, open_run
 Fit = Callable[[Sequence[Run]], Forecaster]
 """Fits a forecaster to runs."""
 
+Moments = tuple[Float32[np.ndarray, "time param"], Float32[np.ndarray, "time param"]]
+"""First and second moments of Adam."""
+
 NULL = 0.02
 """Largest skill, up or down, that passes on random walks."""
 TOLERANCE = 1e-3
@@ -135,13 +138,22 @@ def causality(
     forecaster: Forecaster, run: Run, folder: Path, start: int, horizons: Sequence[int]
 ) -> bool:
     """Whether the forecast is the same to the last bit with another future, and with none."""
-    weights = run.weights[:]
-    other = weights.copy()
+    weights, moments = run.weights[:], adam_of(run)
     rng = np.random.default_rng(0)
-    other[start + 1 :] += rng.normal(size=other[start + 1 :].shape).astype(np.float32)
+
+    def later(values: np.ndarray) -> np.ndarray:
+        other = values.copy()
+        other[start + 1 :] += rng.normal(size=other[start + 1 :].shape).astype(np.float32)
+        return other
+
+    def cut(values: np.ndarray) -> np.ndarray:
+        return values[: start + 1]
+
     forecasts = [
-        forecaster.forecast(run_like(run, rows, folder), [start], list(horizons))
-        for rows in (weights, other, weights[: start + 1])
+        forecaster.forecast(
+            run_like(run, change(weights), folder, _each(change, moments)), [start], list(horizons)
+        )
+        for change in (np.copy, later, cut)
     ]
     return all(np.array_equal(forecasts[0], later) for later in forecasts[1:])
 
@@ -170,7 +182,10 @@ def equivariance(
     """
     order, signs = random_symmetry(run.layout, symmetry, np.random.default_rng(seed))
     weights = run.weights[:]
-    altered = run_like(run, weights[:, order] * signs, folder)
+    moments = adam_of(run)
+    if moments is not None:
+        moments = moments[0][:, order] * signs, moments[1][:, order]
+    altered = run_like(run, weights[:, order] * signs, folder, moments)
     before = forecaster.forecast(run, list(starts), list(horizons))
     after = forecaster.forecast(altered, list(starts), list(horizons))
     expected = before[..., order] * signs
@@ -189,8 +204,9 @@ def scale(
     """Error of the displacement when all steps are longer, relative to the displacement."""
     weights = _on_grid(run.weights[:])
     longer = weights[0] + factor * (weights - weights[0])
+    moments = adam_of(run)
     moved = [
-        forecaster.forecast(run_like(run, rows, folder), list(starts), list(horizons))
+        forecaster.forecast(run_like(run, rows, folder, moments), list(starts), list(horizons))
         - rows[list(starts)][:, None]
         for rows in (weights, longer)
     ]
@@ -235,7 +251,12 @@ def random_walks(
     return walks
 
 
-def run_like(run: Run, weights: Float[np.ndarray, "time param"], folder: Path) -> Run:
+def run_like(
+    run: Run,
+    weights: Float[np.ndarray, "time param"],
+    folder: Path,
+    moments: Moments | None = None,
+) -> Run:
     """A run on disk with other weights, of any length.
 
     Args:
@@ -243,9 +264,15 @@ def run_like(run: Run, weights: Float[np.ndarray, "time param"], folder: Path) -
             go on and the rest stays as it was last.
         weights: of the new run; float32 is stored.
         folder: the new run is written there, named after its weights; if it is there, it is read.
+        moments: Adam's of the new run; None: noise, if the run has moments.
     """
     stored = np.ascontiguousarray(weights, np.float32)
-    digest = hashlib.sha256(stored.tobytes()).hexdigest()[:16]
+    if moments is None and run.info.optimizer_moments:
+        rng = np.random.default_rng(len(stored))
+        mean, square = rng.normal(size=(2, *stored.shape)).astype(np.float32)
+        moments = mean, square**2
+    content = [stored, *(moments or ())]
+    digest = hashlib.sha256(b"".join(array.tobytes() for array in content)).hexdigest()[:16]
     path = folder / f"{run.id[:100]}-{digest}.zarr"
     if path.exists():
         return open_run(path)
@@ -254,11 +281,12 @@ def run_like(run: Run, weights: Float[np.ndarray, "time param"], folder: Path) -
         run_id=path.stem,
         diagnostics=(),
         critic_layout=None,
-        optimizer_moments=False,
+        optimizer_moments=moments is not None,
         probe_observations=0,
         block=128,
     )
     times, iterations, rates = run.num_timesteps, run.iteration, run.learning_rate
+    steps, every = run["index/gradient_step"][:], info.cadence.every if info.cadence else 0
     phases = _phases(run.phase, len(stored))
     observations = _moments(run, "obs_norm") if info.obs_norm is not None else None
     rewards = _moments(run, "ret_norm") if info.ret_norm else None
@@ -273,8 +301,17 @@ def run_like(run: Run, weights: Float[np.ndarray, "time param"], folder: Path) -
                 learning_rate=float(rates[now]),
                 obs_norm=None if observations is None else observations[now],
                 ret_norm=None if rewards is None else rewards[now],
+                gradient_step=int(steps[now]) + (t - now) * every if steps[now] >= 0 else -1,
+                moments=None if moments is None else (moments[0][t], moments[1][t]),
             )
     return open_run(path)
+
+
+def adam_of(run: Run) -> Moments | None:
+    """Adam's moments of a run, if it stores them."""
+    if not run.info.optimizer_moments:
+        return None
+    return run["optimizer/exp_avg"][:], run["optimizer/exp_avg_sq"][:]
 
 
 def random_symmetry(
@@ -302,6 +339,11 @@ def random_symmetry(
                 flips *= np.expand_dims(units[label], [i for i in range(flips.ndim) if i != axis])
         order[param.slice] = places.ravel()
     return order, signs
+
+
+def _each(change: Callable[[np.ndarray], np.ndarray], moments: Moments | None) -> Any:
+    """Other moments: the length may be another."""
+    return None if moments is None else (change(moments[0]), np.abs(change(moments[1])))
 
 
 def _phases(known: Int[np.ndarray, " time"], length: int) -> Int[np.ndarray, " length"]:
@@ -338,6 +380,8 @@ __all__ = [
     "TOLERANCE",
     "Checks",
     "Fit",
+    "Moments",
+    "adam_of",
     "causality",
     "check",
     "drift",

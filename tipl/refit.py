@@ -18,7 +18,7 @@ import weighttraj as wt
 from tipl.baselines import WNN, NinoMLP, Regression, TrainingConfig
 from tipl.baselines.nowcaster import Nowcaster
 from tipl.causal import Causal, CausalTrainConfig, train_causal
-from tipl.checks import NULL, TOLERANCE, Fit, check, run_like
+from tipl.checks import NULL, TOLERANCE, Fit, adam_of, check, run_like
 from tipl.drift import Drift
 from tipl.evaluation.parts import fingerprint
 from tipl.forecast import TIPL, Forecaster
@@ -105,7 +105,7 @@ def as_dataset(runs: Sequence[Run], folder: Path, *, validation: int = 0) -> Pat
         folder: of the data set.
         validation: so many of them, the last ones, are for the validation split.
     """
-    copies = [run_like(run, run.weights[:], folder / "runs") for run in runs]
+    copies = [run_like(run, run.weights[:], folder / "runs", adam_of(run)) for run in runs]
     train = len(copies) - validation
     entries = (
         RunEntry(
@@ -168,6 +168,7 @@ def _gate(old: Gate, runs: Sequence[Run], config: RefitConfig) -> Gate:
             lags=sizes.lags,
             width=sizes.width,
             experts=sizes.experts,
+            adam=sizes.adam,
         )
     )
 

@@ -18,13 +18,13 @@ CAUSAL = CausalConfig(
 )
 
 
-def lively_gate(every: int = 2) -> Gate:
+def lively_gate(every: int = 2, sizes: GateConfig = GATE) -> Gate:
     """All parameters are drawn."""
     torch.manual_seed(0)
-    network = GateNetwork(GATE)
+    network = GateNetwork(sizes)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
-    return Gate(network, GateModelConfig(network=GATE, every=every))
+    return Gate(network, GateModelConfig(network=sizes, every=every))
 
 
 def lively_causal(every: int = 2) -> Causal:

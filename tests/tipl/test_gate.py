@@ -11,18 +11,22 @@ import pytest
 import torch
 
 import weighttraj as wt
+from tests.small import SMALL_RECIPE
 from tests.tipl.lively import GATE, HORIZONS, lively_gate
 from tipl import learn as learning
 from tipl.baselines import Ema
 from tipl.baselines.trajectory import Trajectory
 from tipl.checks import (
     NULL,
+    TOLERANCE,
+    check,
     random_walks,
     run_like,
     skills,
 )
 from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.gate import Gate, GateTrainConfig, train_gate
+from tipl.gate.adam import AdamReader
 from tipl.gate.examples import PARAMS, gather
 from tipl.gate.features import Clock, Structure, features
 from tipl.gate.forecaster import GateModelConfig
@@ -30,6 +34,8 @@ from tipl.gate.history import History, histories
 from tipl.gate.train import relative_error
 from tipl.models.gate import GateNetwork, Input
 from tipl.refit import RefitConfig, refit_of
+from weighttraj.collect import collect
+from weighttraj.collect.recipe import Seeds
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
 
@@ -188,6 +194,87 @@ def test_one_network_serves_policies_of_any_size(tmp_path: Path) -> None:
     gate = replace(lively_gate(), config=GateModelConfig(network=GATE, every=None))
     forecast = gate.forecast(wt.open_run(tmp_path / "wide.zarr"), [0, 9], HORIZONS)
     assert forecast.shape == (2, 3, 30)
+
+
+# Adam's moments
+
+
+@pytest.fixture(scope="module")
+def with_moments(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One run for training and one for tests, a snapshot after each gradient step."""
+    store = replace(SMALL_RECIPE.store, every=1, optimizer_moments=True)
+    recipe = replace(SMALL_RECIPE, store=store, seeds=Seeds(train=[0], test=[2]))
+    folder = tmp_path_factory.mktemp("moments") / "small"
+    collect(recipe, folder)
+    return folder
+
+
+BLIND = replace(GATE, phases=8)
+ADAM = replace(BLIND, adam=True)
+
+
+def test_the_direction_is_the_update_that_adam_made(with_moments: Path) -> None:
+    run = wt.open(with_moments).runs[0]
+    reader, weights, rates = AdamReader(run, len(run) - 1), run.weights[:], run.learning_rate
+    assert not reader.at(0).direction.any()
+    for t in range(1, len(run)):
+        step = weights[t].astype(np.float64) - weights[t - 1]
+        now = reader.at(t)
+        np.testing.assert_allclose(now.direction * rates[t], step, rtol=1e-3, atol=2e-7)
+        assert (now.gradient > 0).any()
+
+
+def test_what_the_optimizer_knows_is_seen(with_moments: Path) -> None:
+    run = wt.open(with_moments).runs[0]
+    structure, clock = Structure.of(run.layout), Clock.of(run)
+    (_, history), *_ = list(histories(run, [30], ADAM.lags, ADAM.betas))
+    adam = AdamReader(run, 30).at(30)
+    plain, seen = (
+        features(history, structure, clock, sizes, moments)
+        for sizes, moments in ((BLIND, None), (ADAM, adam))
+    )
+    assert seen.inputs.shape == (122, ADAM.inputs)
+    assert seen.contexts.shape == (7, ADAM.contexts)
+    # What both see is the same.
+    assert torch.equal(seen.inputs[:, : BLIND.basis], plain.inputs[:, : BLIND.basis])
+    assert torch.equal(seen.inputs[:, ADAM.basis :][:, :3], plain.inputs[:, BLIND.basis :])
+    assert torch.equal(seen.contexts[:, : BLIND.contexts], plain.contexts)
+    cosine = torch.nn.functional.cosine_similarity
+    assert cosine(seen.basis[:, -1], adam.direction, 0) > 0.5
+    for name in get_args(Input):
+        other = features(history, structure, clock, replace(ADAM, without=(name,)), adam)
+        assert torch.equal(other.basis[:, -1], seen.basis[:, -1])
+        assert torch.equal(other.inputs[:, -1], seen.inputs[:, -1])
+        assert torch.equal(other.contexts[:, -3:], seen.contexts[:, -3:])
+
+
+def test_with_moments_it_turns_and_grows_as_weights_do(with_moments: Path, tmp_path: Path) -> None:
+    run = wt.open(with_moments).runs[0]
+    found = check(lively_gate(1, ADAM), run, tmp_path, horizons=HORIZONS)
+    assert found.causality
+    assert max(found.permutation, found.sign or 0, found.scale) < TOLERANCE
+
+
+def test_a_network_with_moments_is_trained_saved_and_loaded(
+    with_moments: Path, config: GateTrainConfig, tmp_path: Path
+) -> None:
+    settings = replace(config, data=(with_moments,), out=tmp_path / "model", adam=True)
+    model = train_gate(settings)
+    run = wt.open(with_moments).split("test").runs[0]
+    assert model.config.network.adam
+    assert np.array_equal(
+        Gate.load(tmp_path / "model").forecast(run, [9], [2]), model.forecast(run, [9], [2])
+    )
+    fit = refit_of(model, RefitConfig(folder=tmp_path, horizons=HORIZONS, batches=2))
+    assert fit is not None
+    walker = fit(random_walks(run, tmp_path, count=4, length=20))
+    assert isinstance(walker, Gate)
+    assert walker.config.network.adam
+
+
+def test_a_run_without_moments_is_refused(config: GateTrainConfig) -> None:
+    with pytest.raises(ModelError, match="optimizer_moments = true"):
+        lively_gate(2, ADAM).forecast(unseen(config), [5], [1])
 
 
 # Training

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tipl.baselines.trajectory import columns_of, stratified
+from tipl.gate.adam import AdamReader
 from tipl.gate.features import Clock, Structure, features
 from tipl.gate.history import histories
 from tipl.learn import Tell, draw_starts, too_short
@@ -101,8 +102,9 @@ def _of_run(
     columns, counts = stratified(structure.tensor.numpy(), POOL, rng)
     weights = columns_of(run.weights, columns)
     starts = draw_starts(len(run), count, rng)
+    adam = AdamReader(run, max(starts)) if config.adam else None
     for place, history in histories(run, starts, config.lags, config.betas):
-        seen = features(history, structure, clock, config)
+        seen = features(history, structure, clock, config, adam.at(history.t) if adam else None)
         scale = float(history.squares.mean().sqrt())
         if scale == 0 or not np.isfinite(scale):
             continue

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import one_hot, softsign
 
+from tipl.gate.adam import Adam
 from tipl.gate.history import History
 from tipl.models.gate import KINDS, LAG_COSINES, GateConfig, Input
 from weighttraj import ParamLayout, Run
@@ -100,17 +101,34 @@ class Features:
     """Steps, averages and drift, as they are."""
 
 
-def features(history: History, structure: Structure, clock: Clock, config: GateConfig) -> Features:
-    """What the network sees at the snapshot where the history ends."""
+def features(
+    history: History,
+    structure: Structure,
+    clock: Clock,
+    config: GateConfig,
+    adam: Adam | None = None,
+) -> Features:
+    """What the network sees at the snapshot where the history ends.
+
+    Args:
+        history: of the weights.
+        structure: of the policy.
+        clock: of the run.
+        config: of the network.
+        adam: moments at the snapshot, if the network sees them.
+    """
     t, steps, averages, drift = history.t, history.steps, history.averages, history.drift
     squares = history.squares
-    basis = torch.cat([steps, averages, drift[None]])
     own = structure.means(squares[None])[0]  # (tensor,)
     everyone = squares.mean()
     scale = (own + TINY).sqrt()[structure.tensor]
+    basis = torch.cat([steps, averages, drift[None]])
+    if adam is not None:
+        basis = torch.cat([basis, (adam.direction * scale)[None]])  # as long as a step of late
     turn = torch.sign(averages[_REFERENCE]) / scale
     inputs = basis * turn
-    inputs[-1] *= max(t, 1) ** 0.5  # a random walk's drift falls with the root of time
+    # A random walk's drift falls with the root of time.
+    inputs[config.drift] *= max(t, 1) ** 0.5
     sizes = torch.stack(
         [squares, *(_shared(squares, place) for place in (structure.row, structure.column))]
     )
@@ -129,6 +147,9 @@ def features(history: History, structure: Structure, clock: Clock, config: GateC
         ],
         dim=1,
     )
+    if adam is not None:
+        gradient, further = _of_adam(adam, structure)
+        inputs, contexts = torch.cat([inputs, gradient]), torch.cat([contexts, further], dim=1)
     inputs = softsign(inputs)
     for name in config.without:
         _hide(name, config, basis, inputs, contexts)
@@ -143,7 +164,7 @@ def _hide(
     contexts: Float[Tensor, "tensor context"],
 ) -> None:
     """Put zeros in the place of a part."""
-    averages, drift, sizes = config.lags, config.basis - 1, config.basis
+    averages, drift, sizes = config.lags, config.drift, config.basis
     size = config.course
     kind = size + 1
     phase = kind + len(KINDS)
@@ -152,15 +173,15 @@ def _hide(
     rows, columns = {
         "steps": (slice(averages), nothing),
         "averages": (slice(averages, drift), nothing),
-        "drift": (slice(drift, sizes), nothing),
-        "sizes": (slice(sizes, None), slice(size, kind)),
+        "drift": (slice(drift, drift + 1), nothing),
+        "sizes": (slice(sizes, sizes + 3), slice(size, kind)),
         "course": (nothing, slice(size)),
         "kind": (nothing, slice(kind, phase)),
         "phase": (nothing, slice(phase, time)),
         "time": (nothing, slice(time, time + 1)),
-        "rate": (nothing, slice(time + 1, None)),
+        "rate": (nothing, slice(time + 1, time + 3)),
     }[name]
-    basis[rows] = 0  # its last row is the last that inputs and basis share
+    basis[rows] = 0  # inputs begin with the basis
     inputs[rows] = 0
     contexts[:, columns] = 0
 
@@ -212,6 +233,24 @@ def _course(
             _log_ratio(squared_drift * max(t, 1), scale),
         ]
     )
+
+
+def _of_adam(
+    adam: Adam, structure: Structure
+) -> tuple[Float[Tensor, "1 param"], Float[Tensor, "tensor 3"]]:
+    """Sizes of gradients, and of what is left of them in their average: all without units."""
+    direction, gradient = (
+        structure.means(of[None] ** 2)[0] for of in (adam.direction, adam.gradient)
+    )
+    one = torch.ones(())
+    everywhere = _log_ratio((adam.direction**2).mean(), one)
+    of_tensor = [
+        _log_ratio(direction, one),
+        everywhere.expand(len(direction)),
+        _log_ratio(gradient, (adam.gradient**2).mean()),
+    ]
+    size = _log_ratio(adam.gradient**2, gradient[structure.tensor])
+    return size[None], torch.stack(of_tensor, dim=1)
 
 
 def _time(clock: Clock, t: int, phases: int) -> Float[Tensor, " number"]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.forecast import Pushed, check_cadence, check_request
+from tipl.gate.adam import AdamReader
 from tipl.gate.features import Clock, Features, Structure, features
 from tipl.gate.history import histories
 from tipl.models.gate import GateConfig, GateNetwork
@@ -36,10 +37,11 @@ class GateModelConfig:
     """Gradient steps from one snapshot to the next in the training runs."""
 
     def told(self) -> dict[str, Any]:
-        """What is written: nothing of inputs that are left out where none is."""
+        """What is written: nothing of what most networks have not."""
         found = asdict(self)
-        if not self.network.without:
-            del found["network"]["without"]
+        for name in ("without", "adam"):
+            if not getattr(self.network, name):
+                del found["network"][name]
         return found
 
 
@@ -88,11 +90,13 @@ class Gate(Pushed):
         rows = rows_of(sizes.horizons, horizons, self.name)
         structure, clock = Structure.of(run.layout), Clock.of(run)
         check_cadence(run, self.config.every, sizes.phases)
+        adam = AdamReader(run, max(starts)) if sizes.adam else None
         self.network.eval()
         with one_torch_thread():
             for place, history in histories(run, starts, sizes.lags, sizes.betas):
                 with torch.no_grad():
-                    seen = features(history, structure, clock, sizes)
+                    now = adam.at(history.t) if adam else None
+                    seen = features(history, structure, clock, sizes, now)
                     moved = self.displacements(seen, structure, rows)
                 yield place, history.weights.numpy(), moved.numpy()
 

@@ -31,6 +31,8 @@ class GateTrainConfig(LearnConfig):
     """Linear filters that it mixes."""
     without: tuple[Input, ...] = ()
     """Zeros instead of these inputs, to learn what they are worth."""
+    adam: bool = False
+    """It sees Adam's moments too, which the runs must store."""
 
 
 def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
@@ -57,6 +59,7 @@ class _GateLearner(Learner[GateExamples]):
             width=config.width,
             experts=config.experts,
             without=config.without,
+            adam=config.adam,
         )
         self._train, self._model = config, GateModelConfig(network=sizes, every=every)
         self.network = GateNetwork(sizes)

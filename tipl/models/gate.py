@@ -51,21 +51,34 @@ class GateConfig:
     """Linear filters that are mixed."""
     without: tuple[Input, ...] = ()
     """Zeros instead of these, to learn what they are worth."""
+    adam: bool = False
+    """Whether it sees the moments of Adam, of runs that store them."""
+
+    @property
+    def drift(self) -> int:
+        """Place in the basis of the mean step since phi_0; Adam's direction follows."""
+        return self.lags + len(self.betas)
 
     @property
     def basis(self) -> int:
-        """What coefficients are for: steps, their averages, and the mean step since phi_0."""
-        return self.lags + len(self.betas) + 1
+        """What coefficients are for: steps, averages, mean step, and where Adam goes next."""
+        return self.drift + 1 + self.adam
 
     @property
     def inputs(self) -> int:
-        """Numbers of a parameter: the basis, and the size of its steps, its row's, its column's."""
-        return self.basis + 3
+        """Numbers of a parameter: the basis, and the size of its steps, its row's, its column's.
+
+        With Adam's moments also the size of its gradient.
+        """
+        return self.basis + 3 + self.adam
 
     @property
     def contexts(self) -> int:
-        """Numbers of a tensor: of itself and of the whole policy, its kind, phase and time."""
-        return self.course + 1 + len(KINDS) + (self.phases + 1) + 3
+        """Numbers of a tensor: of itself and of the whole policy, its kind, phase and time.
+
+        With Adam's moments also how far both follow their average gradient, and its size.
+        """
+        return self.course + 1 + len(KINDS) + (self.phases + 1) + 3 + 3 * self.adam
 
     @property
     def course(self) -> int:
@@ -165,7 +178,10 @@ def _basis_scale(config: GateConfig) -> Float[Tensor, "basis horizon"]:
     """
     steps = [[min(h, 5) ** 0.5 for h in config.horizons]] * config.lags
     averages = [[min(h, 2 / (1 - beta)) for h in config.horizons] for beta in config.betas]
-    return torch.tensor([*steps, *averages, [float(h) for h in config.horizons]])
+    rows = [*steps, *averages, [float(h) for h in config.horizons]]
+    if config.adam:
+        rows.append(steps[0])
+    return torch.tensor(rows)
 
 
 __all__ = ["KINDS", "LAG_COSINES", "GateConfig", "GateNetwork", "Input"]
