@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -11,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from filelock import FileLock
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from zarr.storage import LocalStore, ZipStore
@@ -114,6 +118,23 @@ def test_equal_runs_are_equal_files(tmp_path: Path) -> None:
     again = wt.pack(one, out=tmp_path / "again.zip")
     assert one.read_bytes() == again.read_bytes()
     assert same_as_packed(one)
+
+
+def test_what_a_killed_packing_left_goes_with_the_next(tmp_path: Path) -> None:
+    run = write(tmp_path / "run.zarr")
+    code = (
+        "import os, signal, sys; from weighttraj.format import packing; "
+        "packing.sync = lambda _: os.kill(os.getpid(), signal.SIGKILL); packing.pack(sys.argv[1])"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, str(run.path)], check=False)
+    assert ended.returncode == -signal.SIGKILL
+    (left,) = tmp_path.glob(".*")
+    assert (left / "run.zip").exists()
+    with FileLock(left / "lock"):  # as another process does while it packs
+        wt.pack(run.path)
+        assert left.exists()
+    wt.pack(run.path)
+    assert list(tmp_path.glob(".*")) == []
 
 
 def test_only_finished_runs_are_packed(tmp_path: Path) -> None:

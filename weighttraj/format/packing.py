@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
+import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from weighttraj.errors import FormatError
 from weighttraj.format.live import LiveStore
@@ -133,9 +136,9 @@ def _write(source: RunStore, info: RunInfo, snapshots: slice, target: Path) -> N
         target: the file.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+    with _drafting(target) as folder:
         live = LiveStore.create(
-            Path(folder) / "run.zarr",
+            folder / "run.zarr",
             replace(info, n_committed=0, n_committed_iterations=0),
             {axis: info.committed(axis) for axis in AXES},
         )
@@ -146,7 +149,7 @@ def _write(source: RunStore, info: RunInfo, snapshots: slice, target: Path) -> N
                 some = slice(first + start, first + min(start + step, rows))
                 live.write(name, start, source.read(name, some))
         live.commit(info)
-        draft = Path(folder) / "run.zip"
+        draft = folder / "run.zip"
         write_zip(draft, _members(live.path))
         sync(draft)
         draft.replace(target)
@@ -163,10 +166,10 @@ def copy_packed(path: Path, out: Path, run_id: str) -> None:
     """
     store, source = RunStore.open(path), ZipObjects(path)
     info = replace(store.info, run_id=run_id)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-        metadata = Path(folder) / "zarr.json"
+    with _drafting(out) as folder:
+        metadata = folder / "zarr.json"
         metadata.write_bytes(group_document(info, store.documents, store.tags, store.attributes))
-        draft = Path(folder) / "run.zip"
+        draft = folder / "run.zip"
         write_zip(
             draft,
             ((name, metadata if name == "zarr.json" else source) for name in source.names),
@@ -174,6 +177,21 @@ def copy_packed(path: Path, out: Path, run_id: str) -> None:
         sync(draft)
         draft.replace(out)
     sync(out.parent)
+
+
+@contextlib.contextmanager
+def _drafting(target: Path) -> Iterator[Path]:
+    """A folder beside a file, for what becomes the file. Those that killed processes left go."""
+    for old in target.parent.glob(f".{glob.escape(target.name)}.*.draft"):
+        if (lock := old / "lock").exists():  # and nobody holds it
+            with contextlib.suppress(Timeout), FileLock(lock, timeout=0):
+                shutil.rmtree(old)
+    name = tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".draft", dir=target.parent)
+    try:
+        with FileLock(Path(name) / "lock"):
+            yield Path(name)
+    finally:
+        shutil.rmtree(name, ignore_errors=True)
 
 
 def same_as_packed(path: Path) -> bool:
