@@ -18,6 +18,7 @@ REMOTE = "weighttraj.remote.address"
 ALLOWED = {
     "weighttraj.errors": [],
     "weighttraj.threads": [],
+    "weighttraj.progress": [],
     "weighttraj.engine": ["weighttraj.errors", "weighttraj.engine"],
     "weighttraj.engine.choose": [
         "weighttraj.errors",
@@ -135,6 +136,7 @@ ALLOWED = {
     "weighttraj.format": [FORMAT],
     "weighttraj.environments": ["weighttraj.errors"],
     "weighttraj.collect": [
+        "weighttraj.progress",
         "weighttraj.threads",
         "weighttraj.engine",
         "weighttraj.errors",
@@ -145,6 +147,7 @@ ALLOWED = {
         "weighttraj.policies.simulators",
     ],
     "weighttraj.policies": [
+        "weighttraj.progress",
         "weighttraj.threads",
         "weighttraj.engine",
         "weighttraj.errors",
@@ -164,6 +167,7 @@ ALLOWED = {
     ],
     "weighttraj.publish": ["weighttraj.errors", FORMAT, REMOTE, "weighttraj.publish"],
     "weighttraj.publish.report": [
+        "weighttraj.progress",
         "weighttraj.errors",
         FORMAT,
         "weighttraj.publish",
@@ -196,6 +200,7 @@ ALLOWED = {
         "weighttraj.registry.local",
     ],
     "weighttraj.registry.derive": [
+        "weighttraj.progress",
         "weighttraj.errors",
         "door weighttraj.format",
         "weighttraj.format.catalog",
@@ -219,6 +224,7 @@ ALLOWED = {
     ],
     "weighttraj.registry.transfer": ["weighttraj.format.catalog"],
     "weighttraj.registry.download": [
+        "weighttraj.progress",
         "weighttraj.errors",
         "weighttraj.registry.transfer",
         "door weighttraj.format",
@@ -237,6 +243,7 @@ ALLOWED = {
         REMOTE,
     ],
     "weighttraj.registry.upload": [
+        "weighttraj.progress",
         "weighttraj.errors",
         "weighttraj.registry.transfer",
         "weighttraj.format.lint",
@@ -290,6 +297,7 @@ ALLOWED = {
         "weighttraj.threads",
     ],
     "tipl.drift": [
+        "weighttraj.progress",
         "tipl.baselines.files",
         "tipl.baselines.horizons",
         "tipl.drift",
@@ -318,6 +326,7 @@ ALLOWED = {
         "weighttraj.threads",
     ],
     "tipl.learn": [
+        "weighttraj.progress",
         "tipl.baselines.horizons",
         "tipl.errors",
         "tipl.prepare",
@@ -348,7 +357,7 @@ ALLOWED = {
     ],
     "tipl.distributed": ["tipl.errors"],
     "tipl.state": ["tipl.errors"],
-    "tipl.progress": [],
+    "tipl.progress": ["weighttraj.progress"],
     "tipl.step": ["tipl.distributed", "tipl.errors", "tipl.models", "tipl.tokens"],
     "tipl.train": [
         "tipl.distributed",
@@ -363,6 +372,7 @@ ALLOWED = {
     ],
     "tipl.report": ["tipl.errors", "tipl.report"],
     "tipl.evaluation": [
+        "weighttraj.progress",
         "tipl.baselines",
         "tipl.errors",
         "tipl.evaluation",

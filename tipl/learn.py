@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from torch import Tensor, nn
 
 import weighttraj as wt
@@ -28,6 +28,7 @@ from tipl.errors import TrainError
 from tipl.prepare import digest_of
 from tipl.progress import TrainingBar
 from tipl.state import append_log, cut_log, keep_settings, read_log, read_state, restore, save_state
+from weighttraj.progress import LoggedProgress
 from weighttraj.threads import one_torch_thread
 
 MAY_DIFFER = ("out", "data")
@@ -212,7 +213,9 @@ class _Training(Generic[E]):
 
     def _gather(self, groups: Sequence[Sequence[wt.Run]]) -> E:
         columns = (TextColumn("reading runs"), BarColumn(), MofNCompleteColumn())
-        with Progress(*columns, console=self._console, disable=self._console.quiet) as progress:
+        with LoggedProgress(
+            *columns, console=self._console, disable=self._console.quiet
+        ) as progress:
             bar = progress.add_task("", total=sum(map(len, groups)))
             return self._learner.gather(groups, lambda _: progress.advance(bar))
 

@@ -6,7 +6,9 @@ import time
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+from weighttraj.progress import LoggedProgress
 
 
 class TrainingBar:
@@ -21,7 +23,7 @@ class TrainingBar:
 
     def __init__(self, total: int, start: int, console: Console, error: str = "WPE") -> None:
         # Twice a second: drawing takes time from the training.
-        self._progress = Progress(
+        self._progress = LoggedProgress(
             TextColumn("training"),
             BarColumn(),
             MofNCompleteColumn(),

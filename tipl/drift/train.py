@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 import weighttraj as wt
 from tipl.baselines.horizons import fitted, rows_of
@@ -26,6 +26,7 @@ from tipl.forecast import Forecaster
 from tipl.gate import Gate
 from tipl.prepare import digest_of
 from tipl.state import keep_settings
+from weighttraj.progress import LoggedProgress
 from weighttraj.threads import one_torch_thread
 
 MODE = "held"
@@ -96,7 +97,7 @@ def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=console.quiet) as progress:
+    with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
         measured = [
             parts.get(run.id, _source(settings, run), lambda run=run: _measure(along, run, config))  # type: ignore[misc]
             for run in progress.track(runs)

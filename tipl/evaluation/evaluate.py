@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 import weighttraj as wt
 from tipl.baselines import Persistence, Reconstruction
@@ -24,6 +24,7 @@ from tipl.evaluation.summary import Summary
 from tipl.forecast import TIPL, Forecaster
 from tipl.report import write_report
 from weighttraj.engine import engine_of
+from weighttraj.progress import LoggedProgress
 
 
 def evaluate(
@@ -151,7 +152,7 @@ def _measure(tasks: Sequence[Task], workers: int, console: Console) -> list[Meas
         TimeRemainingColumn(),
     )
     measured: dict[wt.Place, Measured] = {}
-    with Progress(*columns, console=console) as progress, engine_of(workers) as engine:
+    with LoggedProgress(*columns, console=console) as progress, engine_of(workers) as engine:
         bars = {
             what: progress.add_task(what, total=total)
             for what, total in _totals(tasks).items()

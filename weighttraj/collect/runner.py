@@ -12,7 +12,7 @@ from typing import Any, Literal, cast
 
 from filelock import FileLock
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from weighttraj.collect.population import check_config
 from weighttraj.collect.recipe import Collect, Recipe
@@ -23,6 +23,7 @@ from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_data
 from weighttraj.format.catalog import MANIFEST, read_dataset_info, write_dataset_info
 from weighttraj.format.integrity import seal
 from weighttraj.format.storage import PACKED, read_info
+from weighttraj.progress import LoggedProgress
 
 
 def collect(
@@ -188,7 +189,7 @@ def _progress(tasks: list[Task], console: Console) -> Iterator[Report]:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=console) as progress:
+    with LoggedProgress(*columns, console=console) as progress:
         config = tasks[0].recipe.ppo
         total = config.n_iterations * config.n_steps
         bars = {t.seed: progress.add_task(f"seed {t.seed}", total=total) for t in tasks}

@@ -22,7 +22,6 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -38,6 +37,7 @@ from weighttraj.format.storage import PACKED
 from weighttraj.policies.batch import load_policies
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 from weighttraj.policies.simulators import GymnasiumSimulator
+from weighttraj.progress import LoggedProgress
 from weighttraj.remote.address import here
 
 Mode = Literal["deterministic", "sampled"]
@@ -314,7 +314,7 @@ def _play(works: Sequence[_Work], engine: Engine, console: Console) -> None:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    with Progress(*columns, console=console) as progress:
+    with LoggedProgress(*columns, console=console) as progress:
         bar = progress.add_task("returns", total=sum(len(task.rows) for _, task in tasks))
         work_of = {(task.path, task.rows[0]): work for work, task in tasks}
         # Nothing is lost with a worker that is stopped at once.

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from weighttraj.errors import StoreExistsError, WeightTrajError, missing_extra
 from weighttraj.format import Run
 from weighttraj.format.objects import refuse_existing, replace_file
+from weighttraj.progress import LoggedProgress
 from weighttraj.publish import figures
 from weighttraj.publish.curves import (
     KINDS,
@@ -119,7 +120,7 @@ def _progress(console: Console | None) -> Progress:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    return Progress(*columns, console=console or Console(quiet=True))
+    return LoggedProgress(*columns, console=console or Console(quiet=True))
 
 
 def _page(source: Source, *, film: bool, seed: int, progress: Progress) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 
 from weighttraj.errors import FormatError, RegistryError
 from weighttraj.format import (
@@ -29,6 +29,7 @@ from weighttraj.format.catalog import write_dataset_info
 from weighttraj.format.objects import refuse_existing
 from weighttraj.format.packing import copy_packed
 from weighttraj.format.storage import PACKED
+from weighttraj.progress import LoggedProgress
 
 SPLITS = ("train", "validation", "test")
 """Parts of a data set."""
@@ -209,7 +210,7 @@ def _write(
     try:
         (draft / "runs").mkdir(parents=True)
         entries = []
-        with Progress(*columns, console=console, disable=console.quiet) as progress:
+        with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
             for new, (run, part) in progress.track(chosen.items()):
                 entry = RunEntry(
                     id=new, path=f"runs/{new}.zarr{PACKED}", seed=run.info.seed, split=part

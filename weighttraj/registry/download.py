@@ -35,6 +35,7 @@ from weighttraj.format.locate import folders
 from weighttraj.format.objects import refuse_existing, replace_file
 from weighttraj.format.packing import cut
 from weighttraj.format.storage import PACKED
+from weighttraj.progress import LoggedProgress
 from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
@@ -267,7 +268,7 @@ def _cut_all(
     console: Console,
 ) -> None:
     """Read a part of each run from where it is, and pack it here."""
-    with Progress(console=console, disable=console.quiet) as progress:
+    with LoggedProgress(console=console, disable=console.quiet) as progress:
         for run in progress.track(dataset.runs, description="runs"):
             target = draft / "runs" / f"{run.id}.zarr{PACKED}"
             if not target.is_file():  # a packed run appears when it is whole
@@ -333,7 +334,7 @@ def _kept(draft: Path) -> Iterator[None]:
 def _progress(console: Console, total: int) -> Iterator[tuple[Progress, TaskID]]:
     columns = (TextColumn("download"), BarColumn(), DownloadColumn())
     speed = (TransferSpeedColumn(), TimeRemainingColumn())
-    with Progress(*columns, *speed, console=console, disable=console.quiet) as progress:
+    with LoggedProgress(*columns, *speed, console=console, disable=console.quiet) as progress:
         yield progress, progress.add_task("download", total=total)
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+from rich.progress import BarColumn, DownloadColumn, TextColumn, TransferSpeedColumn
 
 from weighttraj.errors import RegistryError
 from weighttraj.format import Dataset, lint, open_dataset, verify
 from weighttraj.format.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
 from weighttraj.format.locate import locate
+from weighttraj.progress import LoggedProgress
 from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.hub import client, hub_error, pinned
@@ -164,7 +165,7 @@ def _send_all(
     store: RemoteStore, folder: Path, lines: list[ManifestLine], console: Console
 ) -> None:
     columns = (TextColumn("upload"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    with Progress(*columns, console=console, disable=console.quiet) as progress:
+    with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
         task = progress.add_task("upload", total=sum(line.size for line in lines))
 
         def send(line: ManifestLine) -> None:
