@@ -28,12 +28,13 @@ from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.gate import Gate, GateTrainConfig, train_gate
 from tipl.gate.adam import AdamReader
 from tipl.gate.examples import PARAMS, gather
-from tipl.gate.features import Clock, Structure, features
+from tipl.gate.features import features
 from tipl.gate.forecaster import GateModelConfig
 from tipl.gate.history import History, histories
 from tipl.gate.train import relative_error
 from tipl.models.gate import GateNetwork, Input
 from tipl.refit import RefitConfig, refit_of
+from tipl.structure import Clock, Structure
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info

@@ -15,8 +15,8 @@ from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.causal.view import SCALE_STEPS, bases_of, local_scale, view
 from tipl.forecast import Pushed, check_cadence, check_request
-from tipl.gate.features import Clock
 from tipl.models.causal import CausalConfig, CausalGPT
+from tipl.structure import Clock
 from weighttraj import Run
 from weighttraj.threads import one_torch_thread
 

@@ -18,7 +18,6 @@ from tipl.baselines.horizons import fitted
 from tipl.baselines.trajectory import columns_of, stratified
 from tipl.causal.forecaster import Causal, CausalModelConfig
 from tipl.causal.view import SCALE_STEPS, View, bases_of, local_scale, view
-from tipl.gate.features import Clock, Structure
 from tipl.learn import (
     LearnConfig,
     Learner,
@@ -29,6 +28,7 @@ from tipl.learn import (
     too_short,
 )
 from tipl.models.causal import CausalConfig, CausalGPT
+from tipl.structure import Clock, Structure
 
 POOL = 4096
 """Parameters of a run that its displacements are measured on."""

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tipl.gate.features import Clock
 from tipl.models.causal import CausalConfig
 from tipl.representation import PrefixBases, PrefixTokens
+from tipl.structure import Clock
 from weighttraj import Run
 
 SCALE_STEPS = 20

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from tipl.baselines.trajectory import columns_of, stratified
 from tipl.gate.adam import AdamReader
-from tipl.gate.features import Clock, Structure, features
+from tipl.gate.features import features
 from tipl.gate.history import histories
 from tipl.learn import Tell, draw_starts, too_short
 from tipl.models.gate import GateConfig
+from tipl.structure import Clock, Structure
 from weighttraj import Run
 
 PARAMS = 128

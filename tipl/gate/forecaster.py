@@ -17,9 +17,10 @@ from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.forecast import Pushed, check_cadence, check_request
 from tipl.gate.adam import AdamReader
-from tipl.gate.features import Clock, Features, Structure, features
+from tipl.gate.features import Features, features
 from tipl.gate.history import histories
 from tipl.models.gate import GateConfig, GateNetwork
+from tipl.structure import Clock, Structure
 from weighttraj import Run
 from weighttraj.threads import one_torch_thread
 

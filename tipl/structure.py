@@ -1,0 +1,92 @@
+"""What a run says beside its weights: which of them belong together, and when each snapshot is.
+
+What networks of ours see of these is relative, so it is the same for a policy with another order
+of its hidden units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tipl.models.gate import KINDS
+from weighttraj import ParamLayout, Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure:
+    """Which parameters belong together."""
+
+    tensor: Int[Tensor, " param"]
+    """Tensor of each parameter."""
+    row: Int[Tensor, " param"]
+    """Row of its tensor, counted over all tensors; of a vector, each element."""
+    column: Int[Tensor, " param"]
+    """The same of columns."""
+    kind: Int[Tensor, " tensor"]
+    """Place in ``KINDS``."""
+    slices: tuple[slice, ...]
+    """Parameters of each tensor."""
+
+    @classmethod
+    def of(cls, layout: ParamLayout) -> Structure:
+        """Of a policy's layout."""
+        size = layout.size
+        tensor, row, column = (np.zeros(size, np.int64) for _ in range(3))
+        rows = columns = 0
+        for number, param in enumerate(layout.params):
+            tensor[param.slice] = number
+            shape = param.shape if len(param.shape) == 2 else (param.size, 1)
+            i, j = (place.ravel() for place in np.indices(shape))
+            is_matrix = len(param.shape) == 2
+            row[param.slice] = rows + i
+            column[param.slice] = columns + (j if is_matrix else i)
+            rows, columns = rows + shape[0], columns + (shape[1] if is_matrix else shape[0])
+        return cls(
+            tensor=torch.from_numpy(tensor),
+            row=torch.from_numpy(row),
+            column=torch.from_numpy(column),
+            kind=torch.tensor([_kind(param.role, param.axes) for param in layout.params]),
+            slices=tuple(param.slice for param in layout.params),
+        )
+
+    def means(self, values: Float[Tensor, "any param"]) -> Float[Tensor, "any tensor"]:
+        """Means over the parameters of each tensor."""
+        return torch.stack([values[:, part].mean(1) for part in self.slices], dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock:
+    """What is known of each snapshot's time."""
+
+    phase: Int[np.ndarray, " time"]
+    """Part of its iteration that ends at a snapshot; -1: none."""
+    rate: Float[np.ndarray, " time"]
+    """Learning rate over the first one; 1 where it is not known."""
+
+    @classmethod
+    def of(cls, run: Run) -> Clock:
+        """Of a run."""
+        rates = np.asarray(run.learning_rate, np.float64)
+        known = rates[np.isfinite(rates)]
+        first = known[0] if len(known) else 1.0
+        return cls(phase=np.asarray(run.phase), rate=np.nan_to_num(rates / first, nan=1.0))
+
+
+def _kind(role: str, axes: tuple[str, ...]) -> int:
+    names = {
+        ("weight", "input"): "input weight",
+        ("weight", "hidden"): "hidden weight",
+        ("weight", "output"): "output weight",
+        ("bias", "hidden"): "hidden bias",
+        ("bias", "output"): "output bias",
+    }
+    place = "output" if "action" in axes else "input" if "observation" in axes else "hidden"
+    return KINDS.index(names.get((role, place), "other"))
+
+
+__all__ = ["Clock", "Structure"]
