@@ -31,7 +31,7 @@ def render(results: dict[str, Any]) -> str:
         "Reading from elsewhere": _bullets(_remote(results)),
         "Collecting and returns": _bullets(_collected(results)),
         "Does a population learn as SB3 does?": _section(_learning, results.get("learning")),
-        "Temporal SVD and training": _bullets(_trained(results)),
+        "Temporal SVD, training, forecasts": _bullets(_trained(results)),
         "Recipes": _section(_tried, results.get("recipes")),
     }
     written = ("\n".join([f"## {title}", "", *lines]) for title, lines in sections.items() if lines)
@@ -131,6 +131,8 @@ def _trained(results: dict[str, Any]) -> Iterator[str]:
         yield _svd(results["svd"])
     if "tipl_train" in results:
         yield _training(results["tipl_train"])
+    if "gate" in results:
+        yield _forecast(results["gate"])
 
 
 def _tried(recipes: dict[str, Any]) -> list[str]:
@@ -185,6 +187,17 @@ def _training(training: dict[str, Any]) -> str:
         f"GFLOP: {beside}{row['gflop_per_s']:.0f} GFLOP/s where a matrix product alone reaches "
         f"{row['gflop_per_s_of_product']:.0f}; 100,000 batches take {row['hours_of_100k']:.1f} "
         "hours."
+    )
+
+
+def _forecast(gate: dict[str, Any]) -> str:
+    low, high = gate["quartiles_ms"]
+    return (
+        f"One forecast of tipl-gate for {gate['parameters']:,} parameters, {gate['horizons']} "
+        f"horizons, on one CPU thread: {gate['forecast_ms']:.0f} ms (quartiles {low:.0f} and "
+        f"{high:.0f}), of which the network with what it sees of parameters "
+        f"{gate['ms']['network']:.0f}, {gate['network_over_product']:.1f} times as long as a "
+        f"matrix product alone takes for its {gate['gflop']:.1f} GFLOP."
     )
 
 

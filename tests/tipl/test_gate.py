@@ -9,6 +9,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 import weighttraj as wt
 from tests.small import SMALL_RECIPE
@@ -19,16 +20,18 @@ from tipl.baselines.trajectory import Trajectory
 from tipl.checks import (
     NULL,
     TOLERANCE,
-    check,
+    causality,
+    equivariance,
     random_walks,
     run_like,
+    scale,
     skills,
 )
 from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.gate import Gate, GateTrainConfig, train_gate
 from tipl.gate.adam import AdamReader
 from tipl.gate.examples import PARAMS, gather
-from tipl.gate.features import features
+from tipl.gate.features import Features, features
 from tipl.gate.forecaster import GateModelConfig
 from tipl.gate.history import History, histories
 from tipl.gate.train import relative_error
@@ -76,19 +79,19 @@ def test_history_is_what_it_says(runs: list[wt.Run]) -> None:
     weights = runs[0].weights[:31].astype(np.float64)
     steps = np.diff(weights, axis=0)
     (_, history), *_ = list(histories(runs[0], [30], 20, (0.5, 0.9)))
-    np.testing.assert_allclose(history.steps, steps[::-1][:20], atol=1e-7)
-    np.testing.assert_allclose(history.drift, steps.mean(0), atol=1e-7)
+    np.testing.assert_allclose(history.basis[:20], steps[::-1][:20], atol=1e-7)
+    np.testing.assert_allclose(history.basis[-1], steps.mean(0), atol=1e-7)
     ema = Ema(0.9)(Trajectory.of(runs[0]), [30])
-    np.testing.assert_allclose(history.averages[1], next(ema)[2][0], atol=1e-7)
+    np.testing.assert_allclose(history.basis[21], next(ema)[2][0], atol=1e-7)
     powers = 0.95 ** np.arange(30)[::-1]
     squares = (powers[:, None] * steps**2).sum(0) / powers.sum()
     np.testing.assert_allclose(history.squares, squares, rtol=1e-4, atol=1e-12)
 
 
 def test_a_walk_that_goes_on_is_the_walk_from_the_beginning(runs: list[wt.Run]) -> None:
-    alone = [h.averages.clone() for _, h in histories(runs[0], [40], 20, (0.9,))]
+    alone = [h.basis.clone() for _, h in histories(runs[0], [40], 20, (0.9,))]
     list(histories(runs[0], [3, 20], 20, (0.9,)))
-    further = [h.averages.clone() for _, h in histories(runs[0], [40], 20, (0.9,))]
+    further = [h.basis.clone() for _, h in histories(runs[0], [40], 20, (0.9,))]
     assert torch.equal(alone[0], further[0])
     places = [place for place, _ in histories(runs[0], [30, 2, 2, 7], 20, (0.9,))]
     assert places == [1, 2, 3, 0]
@@ -99,9 +102,10 @@ def test_features_of_a_run_that_has_not_moved_are_finite(runs: list[wt.Run]) -> 
     history = History(runs[0].weights[0], GATE.lags, GATE.betas)
     for _ in range(2):
         seen = features(history, structure, clock, GATE)
-        assert seen.inputs.shape == (122, GATE.inputs)
+        inputs, _ = seen.of()
+        assert inputs.shape == (GATE.inputs, 122)
         assert seen.contexts.shape == (7, GATE.contexts)
-        assert torch.isfinite(seen.inputs).all()
+        assert torch.isfinite(inputs).all()
         assert torch.isfinite(seen.contexts).all()
         history.push(runs[0].weights[0])
 
@@ -118,6 +122,11 @@ def test_the_structure_knows_rows_columns_and_kinds(runs: list[wt.Run]) -> None:
     assert structure.kind.tolist() == [5, 0, 3, 1, 3, 2, 4]
 
 
+def numbers(seen: Features) -> tuple[Tensor, Tensor, Tensor]:
+    inputs, basis = seen.of()
+    return basis.T, inputs.T, seen.contexts
+
+
 @pytest.mark.parametrize("name", get_args(Input))
 def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
     runs: list[wt.Run], name: Input
@@ -127,8 +136,8 @@ def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
     whole = features(history, structure, clock, GATE)
     without = features(history, structure, clock, replace(GATE, without=(name,)))
     gone = [
-        (getattr(whole, part) != getattr(without, part)).any(0).sum()
-        for part in ("basis", "inputs", "contexts")
+        (one != other).any(0).sum()
+        for one, other in zip(numbers(whole), numbers(without), strict=True)
     ]
     parts = {
         "steps": [20, 20, 0],
@@ -144,7 +153,7 @@ def test_a_part_that_is_left_out_is_zeros_and_nothing_else_is(
     assert gone == parts[name]
     both = replace(GATE, without=get_args(Input))
     nothing = features(history, structure, clock, both)
-    assert not any(part.any() for part in (nothing.basis, nothing.inputs, nothing.contexts))
+    assert not any(part.any() for part in numbers(nothing))
 
 
 # Network
@@ -161,7 +170,8 @@ def test_one_tensor_after_the_other_is_the_whole(runs: list[wt.Run]) -> None:
     for _, history in histories(runs[0], [17], GATE.lags, GATE.betas):
         seen = features(history, structure, clock, GATE)
     with torch.no_grad():
-        whole = gate.network(seen.inputs, seen.contexts, seen.basis, structure.tensor)
+        basis, inputs, contexts = numbers(seen)
+        whole = gate.network(inputs, contexts, basis, structure.tensor)
         parts = gate.displacements(seen, structure, [2, 0])
     assert whole.abs().max() > 1e-4
     torch.testing.assert_close(parts, whole.T[[2, 0]], rtol=1e-4, atol=1e-8)
@@ -234,26 +244,28 @@ def test_what_the_optimizer_knows_is_seen(with_moments: Path) -> None:
         features(history, structure, clock, sizes, moments)
         for sizes, moments in ((BLIND, None), (ADAM, adam))
     )
-    assert seen.inputs.shape == (122, ADAM.inputs)
-    assert seen.contexts.shape == (7, ADAM.contexts)
+    basis, inputs, contexts = numbers(seen)
+    _, known, of_tensors = numbers(plain)
+    assert inputs.shape == (122, ADAM.inputs)
+    assert contexts.shape == (7, ADAM.contexts)
     # What both see is the same.
-    assert torch.equal(seen.inputs[:, : BLIND.basis], plain.inputs[:, : BLIND.basis])
-    assert torch.equal(seen.inputs[:, ADAM.basis :][:, :3], plain.inputs[:, BLIND.basis :])
-    assert torch.equal(seen.contexts[:, : BLIND.contexts], plain.contexts)
-    cosine = torch.nn.functional.cosine_similarity
-    assert cosine(seen.basis[:, -1], adam.direction, 0) > 0.5
+    assert torch.equal(inputs[:, : BLIND.basis], known[:, : BLIND.basis])
+    assert torch.equal(inputs[:, ADAM.basis :][:, :3], known[:, BLIND.basis :])
+    assert torch.equal(contexts[:, : BLIND.contexts], of_tensors)
+    assert torch.nn.functional.cosine_similarity(basis[:, -1], adam.direction, 0) > 0.5
     for name in get_args(Input):
         other = features(history, structure, clock, replace(ADAM, without=(name,)), adam)
-        assert torch.equal(other.basis[:, -1], seen.basis[:, -1])
-        assert torch.equal(other.inputs[:, -1], seen.inputs[:, -1])
-        assert torch.equal(other.contexts[:, -3:], seen.contexts[:, -3:])
+        for one, rest in zip((basis, inputs, contexts), numbers(other), strict=True):
+            assert torch.equal(one[:, -1], rest[:, -1])
 
 
 def test_with_moments_it_turns_and_grows_as_weights_do(with_moments: Path, tmp_path: Path) -> None:
     run = wt.open(with_moments).runs[0]
-    found = check(lively_gate(1, ADAM), run, tmp_path, horizons=HORIZONS)
-    assert found.causality
-    assert max(found.permutation, found.sign or 0, found.scale) < TOLERANCE
+    gate, where = lively_gate(1, ADAM), ([5, 30], HORIZONS)
+    assert causality(gate, run, tmp_path, 30, HORIZONS)
+    for symmetry in ("permutation", "sign"):
+        assert equivariance(gate, run, tmp_path, *where, symmetry=symmetry) < TOLERANCE
+    assert scale(gate, run, tmp_path, *where) < TOLERANCE
 
 
 def test_a_network_with_moments_is_trained_saved_and_loaded(

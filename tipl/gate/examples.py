@@ -115,13 +115,15 @@ def _of_run(
         weight = torch.from_numpy(counts[some] / counts[some].sum()).float()
         missing = PARAMS - len(some)
 
+        inputs, basis = seen.of(chosen)
+
         def fill(values: Tensor, missing: int = missing) -> Tensor:
             return torch.cat([values, values.new_zeros(missing, *values.shape[1:])])
 
         yield {
-            "inputs": fill(seen.inputs[chosen]).half(),
+            "inputs": fill(inputs.T).half(),
             "contexts": seen.contexts.half(),
-            "basis": fill(seen.basis[chosen] / scale).half(),
+            "basis": fill(basis.T / scale).half(),
             "tensor": fill(structure.tensor[chosen]),
             "weight": fill(weight),
             "target": fill(torch.from_numpy(target[some] / scale)).half(),

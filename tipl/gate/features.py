@@ -7,14 +7,15 @@ other signs or another order of its hidden units, or with steps twice as long.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import one_hot, softsign
+from torch.nn.functional import one_hot, pad, softsign
 
 from tipl.gate.adam import Adam
 from tipl.gate.history import History
@@ -23,22 +24,54 @@ from tipl.structure import Clock, Structure
 
 TINY = 1e-30
 """Added to squares, so that what does not move is divided by something."""
+ROWS = 4096
+"""Parameters that are looked at together: what is made of them stays in the caches."""
 _REFERENCE = 2
 """The average whose sign turns a parameter: beta 0.9."""
 _NEAR, _FAR = 1, 3
 """A short average is compared with all from this one on."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """What the network sees of one start."""
+    """What the network sees of one start, until the history goes on.
 
-    inputs: Float[Tensor, "param input"]
-    """Of each parameter."""
+    Of tensors it is there at once; of parameters it is made when they are asked for, some at a
+    time: all of a large policy would not fit into the processor's caches.
+    """
+
     contexts: Float[Tensor, "tensor context"]
     """Of each tensor."""
-    basis: Float[Tensor, "param basis"]
-    """Steps, averages and drift, as they are."""
+    history: History
+    """Of the weights."""
+    config: GateConfig
+    """Of the network."""
+    scale: Float[Tensor, " param"]
+    """RMS step of each parameter's tensor."""
+    sizes: Float[Tensor, "size param"]
+    """How large steps and gradients of a parameter are beside those of others."""
+    adam: Adam | None
+    """Moments of Adam, if the network sees them."""
+
+    def of(
+        self, some: slice | Int[Tensor, " some"] = slice(None)
+    ) -> tuple[Float[Tensor, "input some"], Float[Tensor, "basis some"]]:
+        """What is seen of some parameters, and their steps, averages and drift as they are."""
+        config, scale = self.config, self.scale[some]
+        basis = self.history.basis[:, some]
+        if self.adam is not None:  # as long as a step of late
+            basis = torch.cat([basis, (self.adam.direction[some] * scale)[None]])
+        inputs = basis * (torch.sign(basis[config.lags + _REFERENCE]) / scale)
+        # A random walk's drift falls with the root of time.
+        inputs[config.drift] *= max(self.history.t, 1) ** 0.5
+        inputs = softsign(torch.cat([inputs, self.sizes[:, some]]))
+        if config.without:
+            basis = basis.clone()  # it is the history's
+        for name in config.without:
+            rows, _ = _places(name, config)
+            basis[rows] = 0  # inputs begin with the basis
+            inputs[rows] = 0
+        return inputs, basis
 
 
 def features(
@@ -57,60 +90,46 @@ def features(
         config: of the network.
         adam: moments at the snapshot, if the network sees them.
     """
-    t, steps, averages, drift = history.t, history.steps, history.averages, history.drift
     squares = history.squares
     own = structure.means(squares[None])[0]  # (tensor,)
-    everyone = squares.mean()
     scale = (own + TINY).sqrt()[structure.tensor]
-    basis = torch.cat([steps, averages, drift[None]])
-    if adam is not None:
-        basis = torch.cat([basis, (adam.direction * scale)[None]])  # as long as a step of late
-    turn = torch.sign(averages[_REFERENCE]) / scale
-    inputs = basis * turn
-    # A random walk's drift falls with the root of time.
-    inputs[config.drift] *= max(t, 1) ** 0.5
-    sizes = torch.stack(
+    every = torch.stack(
         [squares, *(_shared(squares, place) for place in (structure.row, structure.column))]
     )
-    inputs = torch.cat([inputs, _log_ratio(sizes, scale**2)])
-    tensors = _course(steps, averages, drift, own, t, structure.means)
-    policy = _course(steps, averages, drift, everyone[None], t, lambda x: x.mean(1, keepdim=True))
-    time = _time(clock, t, config.phases)
-    count = len(own)
+    sizes = _log_ratio(every, scale**2)
+    products, count = _products(history, structure)
+    of_policy = (count[:, None, None] * products).sum(0, keepdim=True) / count.sum()
+    everyone = squares.mean()
     contexts = torch.cat(
         [
-            tensors.T,
-            policy.T.expand(count, -1),
+            _course(products, own, history.t, config),
+            _course(of_policy, everyone[None], history.t, config).expand(len(own), -1),
             _log_ratio(own, everyone)[:, None],
             one_hot(structure.kind, len(KINDS)).float(),
-            time.expand(count, -1),
+            _time(clock, history.t, config.phases).expand(len(own), -1),
         ],
         dim=1,
     )
     if adam is not None:
         gradient, further = _of_adam(adam, structure)
-        inputs, contexts = torch.cat([inputs, gradient]), torch.cat([contexts, further], dim=1)
-    inputs = softsign(inputs)
+        sizes, contexts = torch.cat([sizes, gradient]), torch.cat([contexts, further], dim=1)
     for name in config.without:
-        _hide(name, config, basis, inputs, contexts)
-    return Features(inputs=inputs.T, contexts=contexts, basis=basis.T)
+        _, columns = _places(name, config)
+        contexts[:, columns] = 0
+    return Features(
+        contexts=contexts, history=history, config=config, scale=scale, sizes=sizes, adam=adam
+    )
 
 
-def _hide(
-    name: Input,
-    config: GateConfig,
-    basis: Float[Tensor, "basis param"],
-    inputs: Float[Tensor, "input param"],
-    contexts: Float[Tensor, "tensor context"],
-) -> None:
-    """Put zeros in the place of a part."""
+def _places(name: Input, config: GateConfig) -> tuple[slice, slice]:
+    """Where a part is: among the numbers of a parameter, and among those of a tensor."""
     averages, drift, sizes = config.lags, config.drift, config.basis
     size = config.course
     kind = size + 1
     phase = kind + len(KINDS)
     time = phase + config.phases + 1
     nothing = slice(0)
-    rows, columns = {
+    return {
         "steps": (slice(averages), nothing),
         "averages": (slice(averages, drift), nothing),
         "drift": (slice(drift, drift + 1), nothing),
@@ -121,57 +140,60 @@ def _hide(
         "time": (nothing, slice(time, time + 1)),
         "rate": (nothing, slice(time + 1, time + 3)),
     }[name]
-    basis[rows] = 0  # inputs begin with the basis
-    inputs[rows] = 0
-    contexts[:, columns] = 0
 
 
-Means = Callable[[Float[Tensor, "any param"]], Float[Tensor, "any group"]]
+def _products(
+    history: History, structure: Structure
+) -> tuple[Float[Tensor, "tensor basis basis"], Float[Tensor, " tensor"]]:
+    """Mean products of the steps, averages and drift over each tensor, and its size."""
+    found = []
+    for part in structure.slices:
+        total: Any = 0
+        for some in pieces(part):
+            basis = history.basis[:, some]
+            total = total + basis @ basis.T
+        found.append(total / (part.stop - part.start))
+    count = [part.stop - part.start for part in structure.slices]
+    return torch.stack(found), torch.tensor(count, dtype=torch.float32)
+
+
+def pieces(part: slice) -> Iterator[slice]:
+    """A slice in pieces that the caches hold."""
+    for first in range(part.start, part.stop, ROWS):
+        yield slice(first, min(first + ROWS, part.stop))
 
 
 def _course(
-    steps: Float[Tensor, "lag param"],
-    averages: Float[Tensor, "beta param"],
-    drift: Float[Tensor, " param"],
+    products: Float[Tensor, "group basis basis"],
     scale: Float[Tensor, " group"],
     t: int,
-    means: Means,
-) -> Float[Tensor, "number group"]:
+    config: GateConfig,
+) -> Float[Tensor, "group number"]:
     """How straight a group of parameters goes: cosines between its steps and averages; and sizes.
 
     Args:
-        steps: the last ones.
-        averages: of all.
-        drift: mean step since phi_0.
+        products: means over the group of products of steps, averages and drift.
         scale: mean squared step of each group.
         t: number of the snapshot.
-        means: over the parameters of each group.
+        config: of the network.
     """
-    last, earlier = steps[:1], steps[1 : 1 + LAG_COSINES]
-    missing = LAG_COSINES - len(earlier)
-    if missing:
-        earlier = torch.cat([earlier, torch.zeros(missing, steps.shape[1])])
-    near, far = averages[_NEAR : _NEAR + 1], averages[_FAR:]
-    squared_averages, squared_drift = means(averages**2), means(drift[None] ** 2)
-    squared_last = means(last**2)
-
-    def cosine(product: Tensor, one: Tensor, other: Tensor) -> Tensor:
-        return product / ((one + TINY).sqrt() * (other + TINY).sqrt())
-
+    squared = products.diagonal(dim1=1, dim2=2)
+    length = (squared + TINY).sqrt()
+    cosines = products / (length[:, :, None] * length[:, None])
+    averages, drift = config.lags, config.drift
+    earlier = cosines[:, 0, 1 : min(averages, 1 + LAG_COSINES)]
+    every = slice(averages, drift)
     return torch.cat(
         [
-            cosine(means(last * earlier), squared_last, means(earlier**2)),
-            cosine(means(last * averages), squared_last, squared_averages),
-            cosine(
-                means(near * far),
-                squared_averages[_NEAR : _NEAR + 1],
-                squared_averages[_FAR:],
-            ),
-            cosine(means(averages * drift), squared_averages, squared_drift),
-            _log_ratio(squared_averages, scale),
-            _log_ratio(squared_last, scale),
-            _log_ratio(squared_drift * max(t, 1), scale),
-        ]
+            pad(earlier, (0, LAG_COSINES - earlier.shape[1])),
+            cosines[:, 0, every],
+            cosines[:, averages + _NEAR, averages + _FAR : drift],
+            cosines[:, every, drift],
+            _log_ratio(squared[:, every], scale[:, None]),
+            _log_ratio(squared[:, :1], scale[:, None]),
+            _log_ratio(squared[:, drift : drift + 1] * max(t, 1), scale[:, None]),
+        ],
+        dim=1,
     )
 
 
@@ -212,4 +234,4 @@ def _shared(
     return (torch.bincount(place, values) / torch.bincount(place))[place].to(values.dtype)
 
 
-__all__ = ["Features", "features"]
+__all__ = ["Features", "features", "pieces"]

@@ -17,15 +17,12 @@ from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.forecast import Pushed, check_cadence, check_request
 from tipl.gate.adam import AdamReader
-from tipl.gate.features import Features, features
+from tipl.gate.features import Features, features, pieces
 from tipl.gate.history import histories
 from tipl.models.gate import GateConfig, GateNetwork
 from tipl.structure import Clock, Structure
 from weighttraj import Run
 from weighttraj.threads import one_torch_thread
-
-ROWS = 4096
-"""Parameters that go through the network at a time: their activations stay in the cache."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,13 +110,10 @@ class Gate(Pushed):
         """
         parts = []
         for number, part in enumerate(structure.slices):
-            for first in range(part.start, part.stop, ROWS):
-                some = slice(first, min(first + ROWS, part.stop))
-                moved = self.network.of_one_tensor(
-                    seen.inputs[some], seen.contexts[number], seen.basis[some], rows
-                )
-                parts.append(moved)
-        return torch.cat(parts).T
+            for some in pieces(part):
+                inputs, basis = seen.of(some)
+                parts.append(self.network.of_one_tensor(inputs, seen.contexts[number], basis, rows))
+        return torch.cat(parts, dim=1)
 
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""

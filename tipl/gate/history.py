@@ -34,17 +34,24 @@ class History:
         self.t = 0
         """Snapshots that followed the first."""
         self._first = self._last = torch.from_numpy(np.array(first))
-        self._steps = torch.zeros(lags, len(first))  # a ring; the newest is at t % lags
+        self._lags = self._newest = lags
+        self._steps = torch.zeros(2 * lags, len(first))  # newest first from its place on
         self._betas = torch.tensor(betas)[:, None]
         self._averages = torch.zeros(len(betas), len(first))
         self._squares = torch.zeros(len(first))
+        self._basis = torch.zeros(lags + len(betas) + 1, len(first))
+        self._basis_of = 0
 
     def push(self, weights: Float32[np.ndarray, " param"]) -> None:
         """Go on to the next snapshot."""
         now = torch.from_numpy(np.array(weights))
         step = now - self._last
         self.t, self._last = self.t + 1, now
-        self._steps[self.t % len(self._steps)] = step
+        if self._newest == 0:
+            self._steps[self._lags :] = self._steps[: self._lags]
+            self._newest = self._lags
+        self._newest -= 1
+        self._steps[self._newest] = step
         self._averages.mul_(self._betas).add_((1 - self._betas) * step)
         self._squares.mul_(SQUARES_BETA).addcmul_(step, step, value=1 - SQUARES_BETA)
 
@@ -54,20 +61,20 @@ class History:
         return self._last
 
     @property
-    def steps(self) -> Float[Tensor, "lag param"]:
-        """The last steps, newest first; 0 before the beginning of the run."""
-        count = len(self._steps)
-        return self._steps[(self.t - torch.arange(count)) % count]
+    def basis(self) -> Float[Tensor, "basis param"]:
+        """The past of each parameter: steps, averages, and the mean step since phi_0.
 
-    @property
-    def averages(self) -> Float[Tensor, "beta param"]:
-        """Exponential moving averages of all steps."""
-        return self._averages / (1 - self._betas ** max(self.t, 1))
-
-    @property
-    def drift(self) -> Float[Tensor, " param"]:
-        """Mean step since phi_0."""
-        return (self._last - self._first) / max(self.t, 1)
+        The last steps come newest first, and are 0 before the beginning of the run; averages are
+        exponential moving ones of all steps, one for each beta. It is overwritten as the history
+        goes on: fresh memory for a large policy would take longer than what is written into it.
+        """
+        if self._basis_of != self.t:
+            lags, drift, t = self._lags, len(self._basis) - 1, self.t
+            self._basis[:lags] = self._steps[self._newest : self._newest + lags]
+            torch.div(self._averages, 1 - self._betas**t, out=self._basis[lags:drift])
+            torch.sub(self._last, self._first, out=self._basis[drift]).div_(t)
+            self._basis_of = t
+        return self._basis
 
     @property
     def squares(self) -> Float[Tensor, " param"]:

@@ -16,7 +16,6 @@ from typing import Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 KINDS = ("input weight", "hidden weight", "output weight", "hidden bias", "output bias", "other")
 """What a tensor is in a policy."""
@@ -141,12 +140,14 @@ class GateNetwork(nn.Module):
 
     def of_one_tensor(
         self,
-        inputs: Float[Tensor, "param input"],
+        inputs: Float[Tensor, "input param"],
         context: Float[Tensor, " context"],
-        basis: Float[Tensor, "param basis"],
+        basis: Float[Tensor, "basis param"],
         horizons: list[int],
-    ) -> Float[Tensor, "param horizon"]:
+    ) -> Float[Tensor, "horizon param"]:
         """The same for parameters of one tensor and some horizons, in less time.
+
+        Parameters come last here: what is added up then lies side by side in memory.
 
         Args:
             inputs: as in ``forward``.
@@ -155,19 +156,19 @@ class GateNetwork(nn.Module):
             horizons: places of the wanted horizons.
         """
         hidden = self.context(context)
-        size, count = len(horizons), len(self.experts)
+        count = len(self.experts)
         filters = torch.cat([self.experts, self.of_tensor(hidden)[None]])
         filters = filters.view(count + 1, *self.basis_scale.shape) * self.basis_scale
         # Of all parameters of a tensor, the context is one more bias.
-        z = linear(inputs, self.first.weight, self.first.bias + self.first_context(hidden)).relu_()
-        z = linear(z, self.second.weight, self.second.bias + self.second_context(hidden)).relu_()
-        gates = self.gate(z)
+        first = self.first.bias + self.first_context(hidden)
+        second = self.second.bias + self.second_context(hidden)
+        z = torch.addmm(first[:, None], self.first.weight, inputs).relu_()
+        z = torch.addmm(second[:, None], self.second.weight, z).relu_()
+        gates = torch.addmm(self.gate.bias[:, None], self.gate.weight, z)
         # Each filter's forecast, then their mixture: cheaper than mixing the filters.
-        each = basis @ filters[..., horizons].transpose(0, 1).flatten(1)
-        *mixed, own = torch.split(each, size, dim=1)
-        moved: Tensor = own.clone()
-        for number, forecast in enumerate(mixed):
-            moved.addcmul_(gates[:, number, None], forecast)
+        wanted = filters[..., horizons].transpose(1, 2)  # (filter, horizon, basis)
+        each = (wanted.flatten(0, 1) @ basis).view(count + 1, len(horizons), -1)
+        moved: Tensor = (each[:count] * gates[:, None]).sum(0).add_(each[count])
         return moved
 
 
