@@ -1,0 +1,65 @@
+"""What are Adam's moments worth to tipl-gate? It is trained with and without them.
+
+weighttraj collect docs/studies/adam_moments.toml                       # half an hour of CPU
+python docs/studies/adam_moments.py --models data/results/adam-moments  # train, measure, render
+python docs/studies/adam_moments.py                                     # render what was measured
+
+Trainings that stopped go on. Writes adam_moments.json and the table in adam_moments.md, beside
+this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from page import insert as insert_into
+from variants import compare, table
+
+from tipl.gate import GateTrainConfig
+
+HERE = Path(__file__)
+RESULTS, PAGE = HERE.with_suffix(".json"), HERE.with_suffix(".md")
+DATA = Path("data/inverted-pendulum-v4-ppo-adam")
+WHOLE = "weights alone"
+
+
+def variants(data: Path, models: Path, n_batches: int) -> dict[str, GateTrainConfig]:
+    """What is trained: each with two seeds."""
+    return {
+        f"{name}{', another seed' if seed else ''}": GateTrainConfig(
+            data=(data,),
+            out=models / f"{'adam' if adam else 'weights'}-{seed}",
+            n_batches=n_batches,
+            seed=seed,
+            adam=bool(adam),
+        )
+        for adam, name in enumerate((WHOLE, "with Adam's moments"))
+        for seed in (0, 1)
+    }
+
+
+def insert(page: str) -> str:
+    """The page with the table as the results have it."""
+    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+
+
+def main() -> None:
+    """Measure, if a folder for the models is given, and render."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--models", type=Path, help="folder of the trained networks")
+    parser.add_argument("--data", type=Path, default=DATA, help="runs that store the moments")
+    parser.add_argument("--n-batches", type=int, default=4_000)
+    parser.add_argument("--workers", type=int, default=2)
+    args = parser.parse_args()
+    if args.models:
+        result = compare(variants(args.data, args.models, args.n_batches), WHOLE, args.workers)
+        RESULTS.write_text(json.dumps(result) + "\n")
+    PAGE.write_text(insert(PAGE.read_text()))
+
+
+if __name__ == "__main__":
+    main()
