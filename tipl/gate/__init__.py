@@ -1,8 +1,9 @@
 """tipl-gate: a small network, shared by all parameters, that forecasts from their own past steps.
 
-``history`` walks along a run and keeps what is needed of its past; ``features`` turns that into
-numbers for the network; ``examples`` draws what it is trained on; ``train`` trains it; and
-``forecaster`` is the trained network as a forecaster.
+``history`` walks along a run and keeps what is needed of its past; ``adam`` reads the optimizer's
+moments, for networks that see them; ``features`` turns both into numbers; ``examples`` draws what
+the network is trained on; ``train`` trains it; and ``forecaster`` is the trained network as a
+forecaster.
 """
 
 from tipl.gate.forecaster import Gate
