@@ -25,7 +25,7 @@ demo: setup ## open the released data, collect a run beside it, train TIPL, judg
 	$(BIN)/tipl evaluate $(DEMO)/tipl --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/report --quick --workers 2
 
 test: setup ## run the tests
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
 lint: setup ## check style and types
 	$(BIN)/ruff format --check .

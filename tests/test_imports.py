@@ -298,6 +298,7 @@ ALLOWED = {
         "weighttraj.threads",
     ],
     "tipl.drift": [
+        "tipl.threads",
         "weighttraj.progress",
         "tipl.baselines.files",
         "tipl.baselines.horizons",
@@ -328,6 +329,7 @@ ALLOWED = {
     ],
     "tipl.structure": ["tipl.models.gate", "door weighttraj"],
     "tipl.learn": [
+        "tipl.threads",
         "weighttraj.progress",
         "tipl.baselines.horizons",
         "tipl.errors",
@@ -360,8 +362,10 @@ ALLOWED = {
     "tipl.distributed": ["tipl.errors"],
     "tipl.state": ["tipl.errors"],
     "tipl.progress": ["weighttraj.progress"],
+    "tipl.threads": [],
     "tipl.step": ["tipl.distributed", "tipl.errors", "tipl.models", "tipl.tokens"],
     "tipl.train": [
+        "tipl.threads",
         "tipl.distributed",
         "tipl.errors",
         "tipl.forecast",
@@ -374,6 +378,7 @@ ALLOWED = {
     ],
     "tipl.report": ["tipl.errors", "tipl.report"],
     "tipl.evaluation": [
+        "tipl.threads",
         "weighttraj.progress",
         "tipl.baselines",
         "tipl.errors",

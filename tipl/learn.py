@@ -28,8 +28,8 @@ from tipl.errors import TrainError
 from tipl.prepare import digest_of
 from tipl.progress import TrainingBar
 from tipl.state import append_log, cut_log, keep_settings, read_log, read_state, restore, save_state
+from tipl.threads import threads
 from weighttraj.progress import LoggedProgress
-from weighttraj.threads import one_torch_thread
 
 MAY_DIFFER = ("out", "data")
 """Settings that may change from one start of a training to the next."""
@@ -124,7 +124,7 @@ def learn(
         TrainError: the data sets have no runs to train on, or different cadences; or the folder
             holds a training with other settings.
     """
-    with one_torch_thread(), torch.random.fork_rng(devices=[]):
+    with threads(), torch.random.fork_rng(devices=[]):
         _Training(config, build, console or Console(quiet=True)).run()
 
 

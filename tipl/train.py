@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,6 +17,7 @@ from tipl.prepare import Prepared, prepare
 from tipl.progress import TrainingBar
 from tipl.state import append_log, cut_log, keep_settings, read_state, restore, save_state
 from tipl.step import StepConfig, Stepper, weight_prediction_error
+from tipl.threads import threads
 from tipl.tokens import Batch, TokenSampler
 
 # What may differ from one start of a training to the next: it moves roundings at most.
@@ -81,19 +80,9 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
             finite.
     """
     _check_sizes(config)
-    with _threads(config.threads), open_ranks(config.device) as ranks:
+    with threads(config.threads), open_ranks(config.device) as ranks:
         shown = console if ranks.first else None
         return _train(config, ranks, shown or Console(quiet=True))
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _train(config: TrainConfig, ranks: Ranks, console: Console) -> TIPL:

@@ -26,8 +26,8 @@ from tipl.forecast import Forecaster
 from tipl.gate import Gate
 from tipl.prepare import digest_of
 from tipl.state import keep_settings
+from tipl.threads import threads
 from weighttraj.progress import LoggedProgress
-from weighttraj.threads import one_torch_thread
 
 MODE = "held"
 """How policies act while amplitudes are chosen: samples, with the noise of the start."""
@@ -194,7 +194,7 @@ def _measure(along: Forecaster, run: wt.Run, config: DriftConfig) -> Arrays:
     def quiet(_: int) -> None:
         """Progress is shown by runs."""
 
-    with one_torch_thread(), Player(run, config.episodes, config.seed, modes=modes) as player:
+    with threads(), Player(run, config.episodes, config.seed, modes=modes) as player:
         true = true_returns(player, run, starts, horizons, quiet)
         now = true["now"][0, :, None]
         added = []

@@ -15,9 +15,9 @@ from tipl.evaluation.returns import FRESH, MODES, Player, forecast_returns, true
 from tipl.evaluation.starts import Starts, at_boundary, starts_of
 from tipl.evaluation.weights import Tick, divergences, squared_errors
 from tipl.forecast import Forecaster
+from tipl.threads import threads
 from weighttraj import Place, Run, open_run
 from weighttraj.engine import Tell
-from weighttraj.threads import one_torch_thread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def measure(task: Task, tell: Tell) -> Measured:
 
     ``tell`` hears what was done ("weights", "policies" or "returns"), and how much of it.
     """
-    with one_torch_thread(), _Measurement(task, tell) as measurement:
+    with threads(), _Measurement(task, tell) as measurement:
         return measurement.all()
 
 

@@ -1,0 +1,32 @@
+"""How many threads a computation takes: torch's, and those of NumPy's linear algebra."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from threadpoolctl import ThreadpoolController
+
+np.linalg.norm(np.zeros(1))  # loads the library, which is found where it is loaded
+_LIBRARIES = ThreadpoolController()
+
+
+@contextmanager
+def threads(count: int = 1) -> Iterator[None]:
+    """Let torch and NumPy compute with so many threads.
+
+    Threads of a small product wait for each other in a loop, and where another process has their
+    core they wait for that too: a Temporal SVD then takes up to thirty times as long.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        with _LIBRARIES.limit(limits=count, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+__all__ = ["threads"]
