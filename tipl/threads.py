@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy as np
 import torch
-from threadpoolctl import ThreadpoolController
-
-np.linalg.norm(np.zeros(1))  # loads the library, which is found where it is loaded
-_LIBRARIES = ThreadpoolController()
+from threadpoolctl import threadpool_limits
 
 
 @contextmanager
@@ -23,7 +19,7 @@ def threads(count: int = 1) -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
-        with _LIBRARIES.limit(limits=count, user_api="blas"):
+        with threadpool_limits(count, user_api="blas"):  # of all libraries that are loaded by now
             yield
     finally:
         torch.set_num_threads(before)
