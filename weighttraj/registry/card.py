@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from weighttraj.errors import RegistryError
-from weighttraj.format import Dataset, open_dataset
+from weighttraj.format import Algorithm, Dataset, open_dataset
 from weighttraj.format.catalog import MANIFEST, write_manifest
 from weighttraj.format.locate import locate
 from weighttraj.format.objects import replace_file
@@ -244,12 +244,12 @@ def _collection(dataset: Dataset) -> str:
     seeds = [r.info.seed for r in dataset if r.info.seed is not None]
     if seeds:
         lines.append(f"- seeds {_seeds(seeds)}")
-    if run.info.algorithm is not None:
-        algorithm = run.info.algorithm
-        library = f" of {algorithm.library}" if algorithm.library else ""
-        lines += ["", f"Settings of {algorithm.name}{library}, `{run.id}`:", ""]
-        lines += ["| setting | value |", "|---|---|"]
-        lines += [f"| {k} | {_value(v)} |" for k, v in algorithm.hyperparameters.items()]
+    match run.info.algorithm:
+        case Algorithm(name=name, library=library, hyperparameters=settings):
+            of = f" of {library}" if library else ""
+            lines += ["", f"Settings of {name}{of}, `{run.id}`:", ""]
+            lines += ["| setting | value |", "|---|---|"]
+            lines += [f"| {k} | {_value(v)} |" for k, v in settings.items()]
     return "\n".join(lines)
 
 
