@@ -25,10 +25,10 @@ STUDIES = Path(__file__).parents[1] / "docs/studies"
 def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(STUDIES))
     study = importlib.import_module(name)
-    page = study.PAGE.read_text()
-    assert study.insert(page) == page, f"the page is stale: run python docs/studies/{name}.py"
+    page = study.STUDY.page.read_text()
+    assert study.STUDY.insert(page) == page, f"the page is stale: run python docs/studies/{name}.py"
     stale = page.replace("|---|", "|---:|")
-    assert study.insert(stale) == page != stale
+    assert study.STUDY.insert(stale) == page != stale
 
 
 def test_bring_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

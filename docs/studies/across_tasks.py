@@ -11,8 +11,6 @@ across_tasks.md, beside this file.
 
 from __future__ import annotations
 
-import argparse
-import json
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -20,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from page import insert as insert_into
 from rich.console import Console
 from rich.progress import Progress
+from study import Study, parser
 
 import tipl
 import weighttraj as wt
@@ -35,9 +33,7 @@ from weighttraj.collect import collect, read_recipe
 from weighttraj.collect.recipe import Seeds
 from weighttraj.engine import Tell, engine_of
 
-HERE = Path(__file__)
-RESULTS, PAGE = HERE.with_suffix(".json"), HERE.with_suffix(".md")
-RECIPES = HERE.parents[2] / "datasets"
+RECIPES = Path(__file__).parents[2] / "datasets"
 SHORT = {
     name: f"{name.lower()}-v4-ppo-v1"
     for name in ("Hopper", "Inverted-Double-Pendulum", "Reacher", "Swimmer")
@@ -190,26 +186,22 @@ def _told(cell: Interval, foreign: bool) -> str:
     return f"*{told}*" if foreign else told
 
 
-def insert(page: str) -> str:
-    """The page with the table as the results have it."""
-    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+STUDY = Study(__file__, table)
 
 
 def main() -> None:
     """Collect, train and measure, if a folder is given, and render."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, help="folder of the short runs and the networks")
-    parser.add_argument("--cheetah", type=Path, default=Path("data") / CHEETAH)
-    parser.add_argument("--n-batches", type=int, default=4_000)
-    parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=1)
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--out", type=Path, help="folder of the short runs and the networks")
+    options.add_argument("--cheetah", type=Path, default=Path("data") / CHEETAH)
+    options.add_argument("--n-batches", type=int, default=4_000)
+    options.add_argument("--starts", type=int, default=200)
+    options.add_argument("--workers", type=int, default=1)
+    args = options.parse_args()
     if args.out:
         found = measure(args.out, args.cheetah, args.n_batches, args.starts, args.workers)
-        RESULTS.write_text(json.dumps(found) + "\n")
-    PAGE.write_text(insert(PAGE.read_text()))
+        STUDY.keep(found)
+    STUDY.render()
 
 
 if __name__ == "__main__":

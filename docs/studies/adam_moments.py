@@ -10,17 +10,13 @@ this file.
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 
-from page import insert as insert_into
+from study import Study, parser
 from variants import compare, table
 
 from tipl.gate import GateTrainConfig
 
-HERE = Path(__file__)
-RESULTS, PAGE = HERE.with_suffix(".json"), HERE.with_suffix(".md")
 DATA = Path("data/inverted-pendulum-v4-ppo-adam")
 WHOLE = "weights alone"
 
@@ -40,25 +36,21 @@ def variants(data: Path, models: Path, n_batches: int) -> dict[str, GateTrainCon
     }
 
 
-def insert(page: str) -> str:
-    """The page with the table as the results have it."""
-    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+STUDY = Study(__file__, table)
 
 
 def main() -> None:
     """Measure, if a folder for the models is given, and render."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--models", type=Path, help="folder of the trained networks")
-    parser.add_argument("--data", type=Path, default=DATA, help="runs that store the moments")
-    parser.add_argument("--n-batches", type=int, default=4_000)
-    parser.add_argument("--workers", type=int, default=2)
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--models", type=Path, help="folder of the trained networks")
+    options.add_argument("--data", type=Path, default=DATA, help="runs that store the moments")
+    options.add_argument("--n-batches", type=int, default=4_000)
+    options.add_argument("--workers", type=int, default=2)
+    args = options.parse_args()
     if args.models:
         result = compare(variants(args.data, args.models, args.n_batches), WHOLE, args.workers)
-        RESULTS.write_text(json.dumps(result) + "\n")
-    PAGE.write_text(insert(PAGE.read_text()))
+        STUDY.keep(result)
+    STUDY.render()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ final_normalizer.md, all beside this file.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +17,13 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from page import insert as insert_into
 from rich.progress import track
+from study import Study, parser
 
 import weighttraj as wt
 from weighttraj.policies import Evaluator, env_of, load_policies
 
-HERE = Path(__file__)
-RESULTS, PAGE, PICTURE = (HERE.with_suffix(suffix) for suffix in (".json", ".md", ".svg"))
+PICTURE = Path(__file__).with_suffix(".svg")
 MODES = {"deterministic": True, "sampled": False}
 STAGES = ((0.0, 0.02), (0.02, 0.1), (0.1, 0.3), (0.3, 1.0))
 """Parts of the recorded training, as shares of its environment steps."""
@@ -147,26 +145,22 @@ def draw(results: dict[str, Any]) -> None:
         figure.savefig(PICTURE, metadata={"Date": None})
 
 
-def insert(page: str) -> str:
-    """The page with the table as the results have it."""
-    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+STUDY = Study(__file__, table)
 
 
 def main() -> None:
     """Measure, if data sets are given, and render."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("datasets", type=Path, nargs="*")
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--every", type=int, default=20)
-    parser.add_argument("--first", type=int, default=100, help="all of the first so many too")
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("datasets", type=Path, nargs="*")
+    options.add_argument("--episodes", type=int, default=20)
+    options.add_argument("--every", type=int, default=20)
+    options.add_argument("--first", type=int, default=100, help="all of the first so many too")
+    args = options.parse_args()
     if args.datasets:
         results = {path.name: measure(path, args) for path in args.datasets}
-        RESULTS.write_text(json.dumps(results) + "\n")
-    draw(json.loads(RESULTS.read_text()))
-    PAGE.write_text(insert(PAGE.read_text()))
+        STUDY.keep(results)
+    draw(STUDY.measured())
+    STUDY.render()
 
 
 if __name__ == "__main__":

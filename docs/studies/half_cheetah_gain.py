@@ -8,22 +8,18 @@ Writes half_cheetah_gain.json, and the table in half_cheetah_gain.md, beside thi
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from page import insert as insert_into
 from rich.progress import Progress
+from study import Study, parser
 
 import tipl
 import weighttraj as wt
 from tipl.evaluation.returns import Player, forecast_returns, true_returns
 from tipl.evaluation.statistics import Bootstrap, Interval, mean, ratio_of_sums
 
-HERE = Path(__file__)
-RESULTS, PAGE = HERE.with_suffix(".json"), HERE.with_suffix(".md")
 FORECASTERS = (
     *("tipl-gate-half-cheetah-v4", "tipl-gate-inverted-pendulum-v4"),
     *("last-step", "trend-20", "trend-200", "ema-0.9", "ema-0.95", "ema-0.98"),
@@ -98,25 +94,21 @@ def _told(cell: Interval, digits: int) -> str:
     return f"{value} [{low}, {high}]"
 
 
-def insert(page: str) -> str:
-    """The page with the table as the results have it."""
-    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+STUDY = Study(__file__, table)
 
 
 def main() -> None:
     """Measure, if a data set is given, and render."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path, nargs="?", help="half-cheetah-v4-ppo-v1, collected")
-    parser.add_argument("--h", type=int, default=100)
-    parser.add_argument("--starts", type=int, default=10)
-    parser.add_argument("--episodes", type=int, default=10)
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("data", type=Path, nargs="?", help="half-cheetah-v4-ppo-v1, collected")
+    options.add_argument("--h", type=int, default=100)
+    options.add_argument("--starts", type=int, default=10)
+    options.add_argument("--episodes", type=int, default=10)
+    args = options.parse_args()
     if args.data:
         found = measure(args.data, args.h, args.starts, args.episodes)
-        RESULTS.write_text(json.dumps(found) + "\n")
-    PAGE.write_text(insert(PAGE.read_text()))
+        STUDY.keep(found)
+    STUDY.render()
 
 
 if __name__ == "__main__":

@@ -8,22 +8,17 @@ Writes one_jump.json, and the table in one_jump.md, beside this file.
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from page import insert as insert_into
 from rich.progress import track
+from study import Study, parser
 
 import tipl
 import weighttraj as wt
 from tipl.evaluation.returns import Player, forecast_returns, true_returns
 from tipl.evaluation.statistics import Bootstrap, Interval, mean
 
-HERE = Path(__file__)
-RESULTS, PAGE = HERE.with_suffix(".json"), HERE.with_suffix(".md")
 DATA = "inverted-pendulum-v4-ppo-v1"
 MODELS = ("tipl-gate", "tipl-drift", "tipl-causal", "tipl", "ar-20-phase")
 FORECASTERS = (
@@ -90,24 +85,20 @@ def _told(cell: Interval) -> str:
     return f"{cell['value']:.0f} [{cell['low']:.0f}, {cell['high']:.0f}]"
 
 
-def insert(page: str) -> str:
-    """The page with the table as the results have it."""
-    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+STUDY = Study(__file__, table)
 
 
 def main() -> None:
     """Measure, if asked to, and render."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--measure", action="store_true")
-    parser.add_argument("--t", type=int, default=40)
-    parser.add_argument("--h", type=int, default=50)
-    parser.add_argument("--episodes", type=int, default=20)
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--measure", action="store_true")
+    options.add_argument("--t", type=int, default=40)
+    options.add_argument("--h", type=int, default=50)
+    options.add_argument("--episodes", type=int, default=20)
+    args = options.parse_args()
     if args.measure:
-        RESULTS.write_text(json.dumps(measure(args.t, args.h, args.episodes)) + "\n")
-    PAGE.write_text(insert(PAGE.read_text()))
+        STUDY.keep(measure(args.t, args.h, args.episodes))
+    STUDY.render()
 
 
 if __name__ == "__main__":

@@ -4,41 +4,58 @@ python docs/studies/trained_again.py --out FOLDER NAME [NAME ...]   # train, jud
 python docs/studies/trained_again.py                                # render what was measured
 
 Runs the commands of each card, judges what they made as the card's model was judged, and keeps both
-in trained_again.json. Trainings that stopped go on. Writes the table in trained_again.md, beside
+in trained_again.json. Trainings that stopped go on. HalfCheetah's runs have to be collected first,
+and another CPU makes other runs under the same seeds: with --beside, the zoo's models are judged on
+those that are here too. Writes the table in trained_again.md, beside
 this file.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import shlex
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from page import insert as insert_into
+from study import Study, parser
 
 import tipl
 from tipl.evaluation.statistics import Interval
 from tipl.zoo.metrics import read_metrics
 
-HERE = Path(__file__)
-RESULTS, PAGE = HERE.with_suffix(".json"), HERE.with_suffix(".md")
-ROOT = HERE.parents[2]
+ROOT = Path(__file__).parents[2]
 ZOO = Path(tipl.__file__).parent / "zoo/models"
-FIGURES = {
-    "skill, h = 1": ("skill", "ratio_of_sums", "all", 1),
-    "skill, h = 10": ("skill", "ratio_of_sums", "all", 10),
-    "skill, h = 50": ("skill", "ratio_of_sums", "all", 50),
-    "gain, h = 10": ("gain", "held", 10),
-    "gain, h = 50": ("gain", "held", 50),
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How the models of one data set are judged again."""
+
+    options: str
+    """As the models of the zoo were."""
+    figures: dict[str, tuple[Any, ...]]
+    """Where they stand in a result file, the horizon last."""
+
+
+SKILL = ("skill", "ratio_of_sums", "all")
+GAIN = ("gain", "held")
+JUDGED = {
+    "inverted-pendulum-v4-ppo-v1": Judging(
+        "--return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1",
+        {f"skill, h = {h}": (*SKILL, h) for h in (1, 10, 50)}
+        | {f"gain, h = {h}": (*GAIN, h) for h in (10, 50)},
+    ),
+    "half-cheetah-v4-ppo-v1": Judging(
+        "--starts 60 --function-starts 12 --return-horizons 100 --learning-starts 4 "
+        "--plateau-starts 0 --episodes 5",
+        {f"skill, h = {h}": (*SKILL, h) for h in (1, 10, 50, 200)}
+        | {"function skill, h = 10": ("function_skill", "all", 10), "gain, h = 100": (*GAIN, 100)},
+    ),
 }
-"""Where they stand in a result file."""
-JUDGED = "--return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1"
-"""How the models of the zoo were."""
 
 
 def make(name: str, out: Path) -> Path:
@@ -60,23 +77,36 @@ def run(words: list[str]) -> None:
     subprocess.run([Path(sys.executable).with_name(words[0]), *words[1:]], check=True)  # noqa: S603
 
 
-def measure(names: list[str], out: Path, workers: int) -> dict[str, Any]:
-    """Figures of both, the card's and those of what was made again."""
+def measure(names: list[str], out: Path, beside: bool, workers: int) -> dict[str, Any]:
+    """Figures of models of one data set: the zoo's, and those of what was made again."""
     made = {name: make(name, out) for name in names}
-    metrics = {name: read_metrics(ZOO / name) for name in names}
-    (data,) = {one.results["data"] for one in metrics.values() if one is not None}
-    options = f"--data {data} --out {out / 'report'} {JUDGED} --workers {workers}"
-    run(["tipl", "evaluate", *map(str, made.values()), *shlex.split(options)])
-    judged = json.loads((out / "report/results.json").read_text())["forecasters"]
-    found: dict[str, Any] = {}
-    for name, one in metrics.items():
-        assert one is not None  # noqa: S101
-        card = one.results["forecasters"][one.judged_as]
-        found[name] = {
-            figure: {"card": at(card, path), "again": at(judged[made[name].name], path)}
-            for figure, path in FIGURES.items()
+    metrics = {name: found for name in names if (found := read_metrics(ZOO / name))}
+    (data,) = {one.results["data"] for one in metrics.values()}
+    judging = JUDGED[data]
+    results = judge(list(made.values()), data, judging, out / f"report-{data}", workers)
+    if beside:
+        zoo = [ZOO / name for name in names]
+        known = judge(zoo, data, judging, out / f"report-{data}-zoo", workers)["forecasters"]
+    else:
+        known = {name: one.scores for name, one in metrics.items()}
+    models = {
+        name: {
+            figure: {
+                "zoo": at(known[name], path),
+                "again": at(results["forecasters"][made[name].name], path),
+            }
+            for figure, path in judging.figures.items()
         }
-    return found
+        for name in names
+    }
+    return {data: {"runs": results["runs"], "beside": beside, "models": models}}
+
+
+def judge(models: list[Path], data: str, judging: Judging, out: Path, workers: int) -> Any:
+    """A result file."""
+    options = f"--data {data} --out {out} {judging.options} --workers {workers}"
+    run(["tipl", "evaluate", *map(str, models), *shlex.split(options)])
+    return json.loads((out / "results.json").read_text())
 
 
 def at(scores: dict[str, Any], path: tuple[Any, ...]) -> Interval:
@@ -85,54 +115,65 @@ def at(scores: dict[str, Any], path: tuple[Any, ...]) -> Interval:
     rows: Any = scores
     for key in keys:
         rows = rows[key]
-    return next(row for row in rows if row["h"] == horizon)
+    row = next(row for row in rows if row["h"] == horizon)
+    return Interval(value=row["value"], low=row["low"], high=row["high"])
 
 
-def table(results: dict[str, Any]) -> str:
-    """The card's intervals, and what came out."""
+def table(measured: dict[str, Any]) -> str:
+    """The zoo's intervals, and what came out, a table for each data set."""
+    return "\n\n".join(_table(data, **found) for data, found in measured.items())
+
+
+def _table(data: str, runs: list[str], beside: bool, models: dict[str, Any]) -> str:
+    figures = JUDGED[data].figures
     lines = [
-        "| model | " + " | ".join(FIGURES) + " |",
-        "|---|" + "---:|" * len(FIGURES),
+        f"## {data}",
+        "",
+        "| model | " + " | ".join(figures) + " |",
+        "|---|" + "---:|" * len(figures),
     ]
     lines += [
-        f"| {name} | " + " | ".join(_told(**figures[figure]) for figure in FIGURES) + " |"
-        for name, figures in results.items()
+        f"| {name} | " + " | ".join(_told(**found[figure]) for figure in figures) + " |"
+        for name, found in models.items()
     ]
-    every = [cell for figures in results.values() for cell in figures.values()]
+    every = [cell for found in models.values() for cell in found.values()]
     inside = sum(_inside(**cell) for cell in every)
+    known = "the interval of the zoo's model on the same runs" if beside else "the card's interval"
     told = (
-        f"What was trained again, and behind it the card's interval. {inside} of {len(every)} "
-        "figures lie in it; those that do not are bold."
+        f"What was trained again, judged on {len(runs)} test runs, and behind it {known}. "
+        f"{inside} of {len(every)} figures lie in it; those that do not are bold."
     )
     return "\n".join([*lines, "", told])
 
 
-def _inside(card: dict[str, float], again: dict[str, float]) -> bool:
-    return card["low"] <= again["value"] <= card["high"]
+def _inside(zoo: Interval, again: Interval) -> bool:
+    return zoo["low"] <= again["value"] <= zoo["high"]
 
 
-def _told(card: dict[str, float], again: dict[str, float]) -> str:
-    bold = "" if _inside(card, again) else "**"
-    return f"{bold}{again['value']:.2f}{bold} [{card['low']:.2f}, {card['high']:.2f}]"
+def _told(zoo: Interval, again: Interval) -> str:
+    bold = "" if _inside(zoo, again) else "**"
+    return f"{bold}{again['value']:.2f}{bold} [{zoo['low']:.2f}, {zoo['high']:.2f}]"
 
 
-def insert(page: str) -> str:
-    """The page with the table as the results have it."""
-    return insert_into(page, HERE, table(json.loads(RESULTS.read_text())))
+STUDY = Study(__file__, table)
 
 
 def main() -> None:
     """Train and measure, if models are named, and render."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    options = parser(__doc__)
+    options.add_argument("names", nargs="*", help="models of the zoo, judged on one data set")
+    options.add_argument("--out", type=Path, default=Path("data/results/again"))
+    options.add_argument(
+        "--beside",
+        action="store_true",
+        help="judge the zoo's models too: the test runs here are not those of the cards",
     )
-    parser.add_argument("names", nargs="*", help="models of the zoo, judged on one data set")
-    parser.add_argument("--out", type=Path, default=Path("data/results/again"))
-    parser.add_argument("--workers", type=int, default=2)
-    args = parser.parse_args()
+    options.add_argument("--workers", type=int, default=2)
+    args = options.parse_args()
     if args.names:
-        RESULTS.write_text(json.dumps(measure(args.names, args.out, args.workers)) + "\n")
-    PAGE.write_text(insert(PAGE.read_text()))
+        found = measure(args.names, args.out, args.beside, args.workers)
+        STUDY.keep((STUDY.measured() or {}) | found)
+    STUDY.render()
 
 
 if __name__ == "__main__":
