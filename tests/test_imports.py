@@ -282,7 +282,7 @@ ALLOWED = {
         "tipl.forecast",
         "tipl.representation",
         "door weighttraj",
-        "weighttraj.threads",
+        "tipl.threads",
     ],
     "tipl.gate": [
         "tipl.baselines.files",
@@ -295,7 +295,7 @@ ALLOWED = {
         "tipl.learn",
         "tipl.structure",
         "door weighttraj",
-        "weighttraj.threads",
+        "tipl.threads",
     ],
     "tipl.drift": [
         "tipl.threads",
@@ -312,7 +312,6 @@ ALLOWED = {
         "tipl.prepare",
         "tipl.state",
         "door weighttraj",
-        "weighttraj.threads",
     ],
     "tipl.causal": [
         "tipl.baselines.files",
@@ -325,7 +324,7 @@ ALLOWED = {
         "tipl.models",
         "tipl.representation",
         "door weighttraj",
-        "weighttraj.threads",
+        "tipl.threads",
     ],
     "tipl.structure": ["tipl.models.gate", "door weighttraj"],
     "tipl.learn": [
@@ -337,7 +336,6 @@ ALLOWED = {
         "tipl.progress",
         "tipl.state",
         "door weighttraj",
-        "weighttraj.threads",
     ],
     "tipl.checks": ["tipl.errors", "tipl.forecast", "door weighttraj"],
     "tipl.refit": [
@@ -388,7 +386,6 @@ ALLOWED = {
         "door weighttraj",
         "weighttraj.engine",
         "weighttraj.policies",
-        "weighttraj.threads",
     ],
     "tipl.zoo.remote": [
         "tipl.errors",

@@ -31,8 +31,8 @@ from tipl.baselines.networks import (
 from tipl.baselines.trajectory import Trajectory, samples
 from tipl.errors import TrainError
 from tipl.forecast import check_request
+from tipl.threads import threads
 from weighttraj import Run
-from weighttraj.threads import one_torch_thread
 
 SCALE_STEPS = 20
 """Steps whose RMS is the local scale of the loss."""
@@ -131,7 +131,7 @@ class Nowcaster(ABC):
         groups = torch.from_numpy(self.groups(trajectory))
         out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
         self.network.eval()
-        with one_torch_thread():
+        with threads():
             for place, window in trajectory.windows(starts, self.config.context - 1):
                 x, scale = self.inputs(_filled(window, self.config.context), trajectory)
                 moved = self.network(_tensor(x), _tensor(scale), groups).numpy()
@@ -232,7 +232,7 @@ class NowcasterFit(Generic[N]):
                 expected=f"runs of more than {max(self._config.horizons) + 2} snapshots",
                 do="train for fewer horizons, or collect longer runs",
             )
-        with torch.random.fork_rng(devices=[]), one_torch_thread():
+        with torch.random.fork_rng(devices=[]), threads():
             torch.manual_seed(self._seed)
             network = self._kind.build(self._config)
             standardise(network, examples)

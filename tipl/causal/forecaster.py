@@ -17,8 +17,8 @@ from tipl.causal.view import SCALE_STEPS, bases_of, local_scale, view
 from tipl.forecast import Pushed, check_cadence, check_request
 from tipl.models.causal import CausalConfig, CausalGPT
 from tipl.structure import Clock
+from tipl.threads import threads
 from weighttraj import Run
-from weighttraj.threads import one_torch_thread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Causal(Pushed):
         check_cadence(run, self.config.every, sizes.phases)
         out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
         self.network.eval()
-        with one_torch_thread():
+        with threads():
             for place, t in enumerate(starts):
                 out[place] = run.weights[t]
                 if t < sizes.rank:

@@ -21,8 +21,8 @@ from tipl.gate.features import Features, features, pieces
 from tipl.gate.history import histories
 from tipl.models.gate import GateConfig, GateNetwork
 from tipl.structure import Clock, Structure
+from tipl.threads import threads
 from weighttraj import Run
-from weighttraj.threads import one_torch_thread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class Gate(Pushed):
         check_cadence(run, self.config.every, sizes.phases)
         adam = AdamReader(run, max(starts)) if sizes.adam else None
         self.network.eval()
-        with one_torch_thread():
+        with threads():
             for place, history in histories(run, starts, sizes.lags, sizes.betas):
                 with torch.no_grad():
                     now = adam.at(history.t) if adam else None
