@@ -18,7 +18,7 @@ from rich.table import Table
 import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import WeightTrajError
-from weighttraj.format.locate import clone, locate
+from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.remote import is_remote
 
 app = tyro.extras.SubcommandApp()
@@ -46,7 +46,7 @@ def _collect(args: _Collect) -> None:
     from weighttraj.collect.recipe import parse_seeds
 
     recipe = wt.collect.read_recipe(args.recipe)
-    out = args.out or Path("data") / recipe.id
+    out = args.out or Path(COLLECTED) / recipe.id
     seeds = None if args.seeds is None else parse_seeds(args.seeds)
     dataset = wt.collect.collect(
         recipe,

@@ -9,6 +9,7 @@ import pytest
 import weighttraj as wt
 from weighttraj.cli import main
 from weighttraj.format.locate import folders, locate
+from weighttraj.registry.local import local_datasets
 
 
 def test_a_path_is_itself(small_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,5 +57,14 @@ def test_an_unknown_id_says_where_it_was_looked_for(
 
 def test_the_clones_data_sets_are_looked_through(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WEIGHTTRAJ_DATASETS_PATH", raising=False)
-    _, clone = folders()
+    _, clone, _ = folders()
     assert (clone / "demo" / "recipe.toml").is_file()
+
+
+def test_what_was_collected_here_has_an_id(
+    small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(small_dataset, tmp_path / "data" / "small")
+    monkeypatch.chdir(tmp_path)
+    assert len(wt.open("small")) == 4
+    assert "small" in {dataset.id for dataset in local_datasets()}

@@ -12,6 +12,8 @@ VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
 """Environment variable: folders that hold data sets, as in PATH."""
 HOME = "~/.weighttraj/datasets"
 """Where data sets are kept if the variable names no folder."""
+COLLECTED = "data"
+"""Where data sets are collected, below the working directory."""
 
 _ID = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,127}/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
@@ -21,7 +23,8 @@ def locate(path: str | Path) -> Path:
 
     An id, with a namespace or without, is looked for in the folders of
     ``WEIGHTTRAJ_DATASETS_PATH``, or else in ``~/.weighttraj/datasets``, then in ``datasets`` of the
-    clone that this package was installed from. There, ``<id>`` or ``<id>/data`` is the data set.
+    clone that this package was installed from, then in ``data`` of the working directory, where
+    data sets are collected. There, ``<id>`` or ``<id>/data`` is the data set.
 
     Raises:
         FileNotFoundError: the id is in none of them.
@@ -36,7 +39,7 @@ def locate(path: str | Path) -> Path:
     for place in places:
         if (place / "dataset.json").is_file():
             return place
-    looked = ", ".join(str(folder) for folder in folders()) or "no folder"
+    looked = ", ".join(str(folder) for folder in folders())
     raise FileNotFoundError(
         f"no data set or run at {name}, and none of that id in {looked}; "
         f"set {VARIABLE} to the folders that hold your data sets"
@@ -47,7 +50,8 @@ def folders() -> list[Path]:
     """Folders in which data sets are looked for, the first one first."""
     named = [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
     own = clone()
-    return [Path(name).expanduser() for name in named or [HOME]] + ([own] if own else [])
+    kept = [Path(name).expanduser() for name in named or [HOME]]
+    return [*kept, *([own] if own else []), Path(COLLECTED)]
 
 
 def clone() -> Path | None:
@@ -56,4 +60,4 @@ def clone() -> Path | None:
     return place if place.is_dir() else None
 
 
-__all__ = ["HOME", "VARIABLE", "clone", "folders", "locate"]
+__all__ = ["COLLECTED", "HOME", "VARIABLE", "clone", "folders", "locate"]

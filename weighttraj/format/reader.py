@@ -442,8 +442,8 @@ def open_dataset(
     """Open a data set: a folder, one HDF5 file (``.h5``), an id, or an address.
 
     Ids are looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH`` (where it names none, in
-    ``~/.weighttraj/datasets``) and in those of a clone. A data set that is still being collected
-    opens too, with the runs that exist so far.
+    ``~/.weighttraj/datasets``), in those of a clone, and in ``data`` of the working directory. A
+    data set that is still being collected opens too, with the runs that exist so far.
 
     At an address (``hf://org/name``, ``s3://``, ``gs://``, ``az://``, ``https://``, ``file://``)
     nothing is downloaded but what is read: the list of runs now, then parts of runs. HDF5 files

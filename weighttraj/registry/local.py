@@ -43,7 +43,7 @@ def local_datasets() -> list[LocalDataset]:
     """Every data set that can be named by an id here; of two with one id the one that is found.
 
     See ``weighttraj.format.locate``: the folders of ``WEIGHTTRAJ_DATASETS_PATH``, the one for
-    downloads, and ``datasets`` of a clone.
+    downloads, ``datasets`` of a clone, and ``data`` of the working directory.
     """
     found: dict[str, LocalDataset] = {}
     for folder in folders():
