@@ -189,8 +189,9 @@ def _ladder(metrics: Metrics) -> str:
     }
     told = verdict(own) if metrics.judged_as.startswith("tipl") else ""
     note = (
-        "95 % intervals: bootstrap over runs. Skill: 0 is the copy of the last weights, 1 the "
-        "truth. Of the baselines the best ones are shown."
+        "95 % intervals: bootstrap over runs; what another training would give is not in them. "
+        "Skill: 0 is the copy of the last weights, 1 the truth. Of the baselines the best ones are "
+        "shown."
     )
     if metrics.results["modes"]:
         note += (
