@@ -184,7 +184,7 @@ def test_ema_is_its_recursion(template: wt.Run, folder: Path) -> None:
 
 def test_a_trend_is_the_slope_of_the_best_line(unseen: wt.Run) -> None:
     weights = unseen.weights[:].astype(np.float64)
-    for start, window in ((30, 5), (3, 20)):
+    for start, window in ((30, 5), (3, 20), (1, 20)):
         rows = weights[max(0, start + 1 - window) : start + 1]
         slope = np.polyfit(np.arange(len(rows)), rows, 1)[0]
         got = Extrapolation(Slope(window)).forecast(unseen, [start], [4])[0, 0]

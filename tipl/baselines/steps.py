@@ -65,7 +65,7 @@ class Slope(Features):
         """The features of each start; 0 for phi_0."""
         for place, window in trajectory.windows(starts, self.window - 1):
             time = np.arange(len(window)) - (len(window) - 1) / 2
-            slope = time @ window / max(float(time @ time), 1.0)
+            slope = time @ window / (float(time @ time) or 1.0)  # phi_0 alone has no slope
             yield place, window[-1], slope[None]
 
 
