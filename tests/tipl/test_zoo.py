@@ -26,6 +26,8 @@ from tipl import (
     load,
     train,
 )
+from tipl.baselines import Extrapolation, Slope
+from tipl.drift import Further
 from tipl.errors import EvaluateError, ForecastError, ModelError
 from tipl.evaluation.parts import fingerprint
 from tipl.forecast import TIPLConfig
@@ -202,12 +204,38 @@ def test_results_of_other_bytes_are_refused(
     (tmp_path / "checks.json").write_text(json.dumps(wrong))
     with pytest.raises(ModelError, match="the checks are not of this model"):
         release(trained, "tipl-small", results=results, checks=tmp_path / "checks.json")
-    # A new draft of other bytes has no figures; one of the same bytes keeps them.
-    release(trained, "tipl-small")
-    assert read_metrics(zoo / "tipl-small") is not None
+    assert names() == ["tipl-small"]
+    # What was refused changed nothing; a new draft of the same bytes keeps the figures, and one of
+    # others has none.
     with pytest.raises(ModelError, match="not of this model"):
         release(other, "tipl-small", results=results)
+    release(trained, "tipl-small")
+    found = read_metrics(zoo / "tipl-small")
+    assert found is not None
+    release(other, "tipl-small")
     assert read_metrics(zoo / "tipl-small") is None
+
+
+def test_what_lies_in_the_zoo_can_be_judged_anew(
+    trained: Path, zoo: Path, results: Path, checks: Path, tmp_path: Path
+) -> None:
+    out = release(trained, "tipl-small", results=results, checks=checks)
+    first = read_metrics(out)
+    document = json.loads(results.read_text())
+    anew = tmp_path / "anew.json"
+    anew.write_text(json.dumps(document | {"runs": ["seed0003"]}))
+    release(out, "tipl-small", results=anew)
+    found = read_metrics(out)
+    assert first is not None
+    assert found == replace(first, results=first.results | {"runs": ["seed0003"]})
+
+
+def test_what_goes_along_another_is_released_with_it(zoo: Path, tmp_path: Path) -> None:
+    Further(Extrapolation(Slope(5)), {1: 2.0}).save(tmp_path / "further")
+    release(tmp_path / "further", "trend-5-further")
+    found = load("trend-5-further")
+    assert isinstance(found, Further)
+    assert (found.along, found.amplitudes) == (Extrapolation(Slope(5)), {1: 2.0})
 
 
 def big(folder: Path, n_embd: int) -> TIPL:
@@ -254,6 +282,7 @@ def test_what_is_judged_before_it_is_rounded_is_refused(
 
     with pytest.raises(ModelError, match="not of this model"):
         release(tmp_path / "big", "big", results=judged(model, tmp_path / "early"))
+    release(tmp_path / "big", "big")
     out = release(tmp_path / "big", "big", results=judged(load("big"), tmp_path / "late"))
     assert read_metrics(out) is not None
 

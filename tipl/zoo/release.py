@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -62,6 +64,9 @@ def release(
 ) -> Path:
     """Copy a forecaster into the zoo; with results, also what is known of it.
 
+    Nothing in the zoo changes before all of it was found good. What was known of the same bytes
+    and is not given again stays: a model that lies in the zoo can be judged anew.
+
     Args:
         folder: of the trained model; its train.json and log.jsonl are read, if they are there.
         name: in the zoo.
@@ -79,31 +84,50 @@ def release(
     _check_name(name)
     kind = lookup.kind_of(folder)
     out = lookup.MODELS / name
-    _copy(folder, out)
-    forecaster = lookup.load(out)
-    mark = fingerprint(forecaster)
-    known = read_metrics(out)
-    if known is not None and known.fingerprint != mark:
-        (out / FILE).unlink()  # of a model that was released before
-    if results is None:
-        return out
-    document = json.loads(results.read_text())
-    judged_as = _find(document, mark, name, results)
-    settings = _json(folder / "train.json")
-    metrics = Metrics(
-        name=name,
-        kind=kind,
-        causal=forecaster.causal,
-        fingerprint=mark,
-        judged_as=judged_as,
-        results=reduced(document, judged_as),
-        trained_on=_trained_on(settings),
-        settings={k: v for k, v in settings.items() if k not in _OF_THE_MACHINE},
-        log=thinned(folder / "log.jsonl") if log else [],
-        checks=None if checks is None else _checks(checks, mark, name),
-    )
-    write_metrics(out, metrics)
+    with TemporaryDirectory() as scratch:
+        draft = Path(scratch) / name
+        _copy(folder, draft)
+        forecaster = lookup.load(draft)
+        mark = fingerprint(forecaster)
+        known = read_metrics(out)
+        if known is not None and known.fingerprint != mark:
+            known = None  # of a model that was released before
+        metrics = known
+        if results is not None:
+            document = json.loads(results.read_text())
+            judged_as = _find(document, mark, name, results)
+            metrics = Metrics(
+                name=name,
+                kind=kind,
+                causal=forecaster.causal,
+                fingerprint=mark,
+                judged_as=judged_as,
+                results=reduced(document, judged_as),
+                **_training(folder, known, log),
+                checks=_checks(checks, mark, name) if checks else known.checks if known else None,
+            )
+        shutil.copytree(draft, out, dirs_exist_ok=True)
+    if metrics is None:
+        (out / FILE).unlink(missing_ok=True)
+    else:
+        write_metrics(out, metrics)
     return out
+
+
+def _training(folder: Path, known: Metrics | None, log: bool) -> dict[str, Any]:
+    """What the folder says of the training, or else what was known of it."""
+    settings = _json(folder / "train.json")
+    if not settings and known is not None:
+        return {
+            "trained_on": known.trained_on,
+            "settings": known.settings,
+            "log": known.log if log else [],
+        }
+    return {
+        "trained_on": _trained_on(settings),
+        "settings": {k: v for k, v in settings.items() if k not in _OF_THE_MACHINE},
+        "log": thinned(folder / "log.jsonl") if log else [],
+    }
 
 
 def reduced(results: dict[str, Any], judged_as: str) -> dict[str, Any]:
@@ -163,6 +187,8 @@ def _copy(folder: Path, out: Path) -> None:
     if packed is not None:
         (out / _ARRAYS).write_bytes(packed)
     (out / "config.json").write_bytes((folder / "config.json").read_bytes())
+    for inner in folder.glob("*/config.json"):  # a forecast along another one
+        _copy(inner.parent, out / inner.parent.name)
 
 
 def _rounds(array: np.ndarray) -> bool:
@@ -178,8 +204,8 @@ def _find(results: dict[str, Any], mark: str, name: str, where: Path) -> str:
             expected=f"a forecaster of fingerprint {mark}, on the validation or test split",
             got=f"{results['split']} split: {marks}",
             where=where,
-            do=f"judge the model as it now lies in the zoo, `tipl evaluate {name} ...`, and give "
-            "those results",
+            do="release it without results, judge what then lies in the zoo, "
+            f"`tipl evaluate {name} ...`, and give those results",
         )
     return next(str(n) for n, m in marks.items() if m == mark)
 
@@ -192,7 +218,8 @@ def _checks(file: Path, mark: str, name: str) -> dict[str, Any]:
             expected=f"fingerprint {mark}",
             got=checks.get("fingerprint"),
             where=file,
-            do=f"check the model as it now lies in the zoo: `tipl check {name} ...`",
+            do=f"release it without them, and check what then lies in the zoo: `tipl check {name} "
+            "...`",
         )
     return checks
 
