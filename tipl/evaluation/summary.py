@@ -29,9 +29,9 @@ PHASES = ("learning", "plateau")
 NEAR = 10
 """The paper's horizons end here."""
 
-Errors = Float[np.ndarray, "run start horizon *tensor"]
-Chosen = Bool[np.ndarray, "run start"]
-Shares = Float[np.ndarray, "run start"]
+Errors = Float[np.ndarray, "start horizon tensor"]
+Chosen = Bool[np.ndarray, " start"]
+Shares = Float[np.ndarray, " start"]
 
 
 class Summary:
@@ -66,37 +66,43 @@ class Summary:
         return dict(zip(MODES, each.tolist(), strict=True))
 
     def _skills(self, name: str) -> dict[str, Any]:
-        boundary = np.stack([m.boundary for m in self._measured])
-        error = np.stack([m.weights[name]["squared"] for m in self._measured])
-        copy = np.stack([m.weights[self._copy]["squared"] for m in self._measured])
-        share = np.stack([shares(m.starts.weights) for m in self._measured])
-        return {
-            aggregate: {
-                kind: self._rows(
-                    self._config.horizons,
-                    self._bootstrap.interval(
-                        _SKILLS[aggregate], *_summed(aggregate, error, copy, share * chosen)
-                    ),
-                )
-                for kind, chosen in _kinds(boundary).items()
-            }
-            for aggregate in AGGREGATES
-        }
+        runs = [
+            (
+                m.weights[name]["squared"],
+                m.weights[self._copy]["squared"],
+                m.boundary,
+                shares(m.starts.weights),
+            )
+            for m in self._measured
+        ]
+        return {aggregate: self._by_kind(aggregate, runs) for aggregate in AGGREGATES}
 
     def _function_skills(self, name: str) -> dict[str, Any]:
-        boundary = np.stack([m.function_boundary for m in self._measured])
-        error = np.stack([m.functions[name]["kl"] for m in self._measured])[..., None]
-        copy = np.stack([m.functions[self._copy]["kl"] for m in self._measured])[..., None]
-        share = np.stack([shares(m.function_starts) for m in self._measured])
-        return {
-            kind: self._rows(
-                self._config.horizons,
-                self._bootstrap.interval(
-                    _skill, *_summed("ratio_of_sums", error, copy, share * chosen)
-                ),
+        runs = [
+            (
+                m.functions[name]["kl"][..., None],
+                m.functions[self._copy]["kl"][..., None],
+                m.function_boundary,
+                shares(m.function_starts),
             )
-            for kind, chosen in _kinds(boundary).items()
-        }
+            for m in self._measured
+        ]
+        return self._by_kind("ratio_of_sums", runs)
+
+    def _by_kind(
+        self, aggregate: str, runs: Sequence[tuple[Errors, Errors, Chosen, Shares]]
+    ) -> dict[str, Any]:
+        """A skill over each kind of start, of runs that may have different starts."""
+        found = {}
+        for kind in KINDS:
+            each = [
+                _summed(aggregate, error, copy, share * _of_kind(kind, boundary))
+                for error, copy, boundary, share in runs
+            ]
+            samples = (np.stack(part) for part in zip(*each, strict=True))
+            cells = self._bootstrap.interval(_SKILLS[aggregate], *samples)
+            found[kind] = self._rows(self._config.horizons, cells)
+        return found
 
     def _wpe(self, name: str) -> list[dict[str, Any]]:
         size = self._measured[0].tensors.sum()
@@ -192,12 +198,12 @@ class Summary:
         return [{"h": h, **cell} for h, cell in zip(horizons, cells, strict=True)]
 
 
-def _kinds(boundary: Chosen) -> dict[str, Chosen]:
-    return dict(zip(KINDS, (np.ones_like(boundary), ~boundary, boundary), strict=True))
+def _of_kind(kind: str, boundary: Chosen) -> Chosen:
+    return {"all": np.ones_like(boundary), "within": ~boundary, "boundary": boundary}[kind]
 
 
 def _summed(aggregate: str, error: Errors, copy: Errors, share: Shares) -> tuple[Any, ...]:
-    """What a skill is computed from: a row for each run, so that runs can be drawn.
+    """What a skill is computed from, of one run, so that runs can be drawn.
 
     Args:
         aggregate: which skill.
@@ -206,14 +212,14 @@ def _summed(aggregate: str, error: Errors, copy: Errors, share: Shares) -> tuple
         share: how much each start counts; 0: it is left out.
     """
     if aggregate == "mean_of_ratios":
-        ratios = 1 - quotient(error.sum(3), copy.sum(3))
+        ratios = 1 - quotient(error.sum(2), copy.sum(2))
         known = np.isfinite(ratios)
-        counts = np.where(known, share[:, :, None], 0.0)
-        return (quotient((np.where(known, ratios, 0.0) * counts).sum(1), counts.sum(1)),)
-    weight = share[:, :, None, None]
-    sums = (np.where(weight > 0, weight * each, 0.0).sum(1) for each in (error, copy))
+        counts = np.where(known, share[:, None], 0.0)
+        return (quotient((np.where(known, ratios, 0.0) * counts).sum(0), counts.sum(0)),)
+    weight = share[:, None, None]
+    sums = (np.where(weight > 0, weight * each, 0.0).sum(0) for each in (error, copy))
     if aggregate == "ratio_of_sums":
-        return tuple(each.sum(2) for each in sums)
+        return tuple(each.sum(1) for each in sums)
     return tuple(sums)
 
 
