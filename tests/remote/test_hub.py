@@ -172,6 +172,19 @@ def test_a_model_of_ones_own(hub: stand_in.Hub, tmp_path: Path) -> None:
     assert tipl.load("hf://us/mine-too").name == "mine-too"
 
 
+def test_of_a_training_only_the_model_is_published(hub: stand_in.Hub, tmp_path: Path) -> None:
+    folder = tmp_path / GATE  # called as one of the zoo: a folder comes first, as in load
+    tipl.load("ar-20-phase-inverted-pendulum-v4").save(folder)
+    for name in ("state.safetensors", "train.json", "log.jsonl"):
+        (folder / name).write_text("of this machine")
+    (folder / "README.md").write_text("# Mine\n")
+    tipl.push(folder, "hf://us/mine")
+    files = hub.files("models/us/mine")
+    assert not {"state.safetensors", "train.json", "log.jsonl"} & set(files)
+    assert files["README.md"] == b"# Mine\n"
+    assert type(tipl.load("hf://us/mine")) is type(tipl.load(folder))
+
+
 def test_code_in_a_repository_is_left_there(hub: stand_in.Hub, tmp_path: Path) -> None:
     tipl.push(GATE, "hf://us/gate")
     repository = hub.repositories["models/us/gate"]

@@ -58,10 +58,7 @@ def load(name: str | Path, *, revision: str | None = None) -> Forecaster:
             replace(forecaster, name=called) if _has_a_name(forecaster) else forecaster
         )
         return named
-    path = Path(name)
-    if not (path / "config.json").is_file() and str(name) in names():
-        path = MODELS / path
-    if (path / "config.json").is_file():
+    if (path := folder_of(name)) is not None:
         return KINDS[kind_of(path)].load(path)
     if str(name) in baselines.names():
         return baselines.by_name(str(name))
@@ -72,6 +69,14 @@ def load(name: str | Path, *, revision: str | None = None) -> Forecaster:
         got=str(name),
         do="name the folder that `tipl train` or `tipl fit` made, or see `tipl zoo`",
     )
+
+
+def folder_of(name: str | Path) -> Path | None:
+    """Where a forecaster lies: a folder, or else a model of the zoo; None: neither."""
+    path = Path(name)
+    if (path / "config.json").is_file():
+        return path
+    return MODELS / path if str(name) in names() else None
 
 
 def _has_a_name(forecaster: Any) -> bool:
@@ -104,4 +109,4 @@ def _nothing(folder: Path, got: object) -> ModelError:
     )
 
 
-__all__ = ["KINDS", "MODELS", "kind_of", "load", "names"]
+__all__ = ["KINDS", "MODELS", "folder_of", "kind_of", "load", "names"]

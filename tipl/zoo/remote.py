@@ -105,17 +105,19 @@ def _push_to_hub(folder: Path, place: RemotePath, private: bool) -> str:
 
 def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None:
     """The files of a model and its card, as they are published."""
-    name = str(model) if isinstance(model, str | Path) else ""
-    released = name in lookup.names()
-    if isinstance(model, str | Path):
-        lookup.load(model)  # raises if it is none
-        shutil.copytree(lookup.MODELS / name if released else name, out)
-    else:
-        model.save(out)
-    if card is None and released:
-        card = Path(__file__).parents[2] / "cards/models" / f"{name}.md"
+    folder = lookup.folder_of(model) if isinstance(model, str | Path) else None
+    released = folder is not None and folder.parent == lookup.MODELS
+    if folder is not None and released:
+        shutil.copytree(folder, out)
+    else:  # of a training only the model: its state, log and settings are of this machine
+        forecaster = lookup.load(model) if isinstance(model, str | Path) else model
+        forecaster.save(out)
+    if card is None and folder is not None and released:
+        card = Path(__file__).parents[2] / "cards/models" / f"{folder.name}.md"
         if not card.is_file():  # only a clone has those with prose by hand
-            card = write_card(name, out.with_name("cards"))
+            card = write_card(folder.name, out.with_name("cards"))
+    if card is None and folder is not None and (folder / "README.md").is_file():
+        card = folder / "README.md"
     if card is not None:
         shutil.copyfile(card, out / "README.md")
     if not (out / "README.md").is_file():
