@@ -12,7 +12,7 @@ from tests.tipl.lively import CAUSAL, HORIZONS, lively_causal
 from tipl.causal import Causal, CausalTrainConfig, train_causal
 from tipl.causal.forecaster import CausalModelConfig
 from tipl.causal.train import _CausalLearner
-from tipl.checks import NULL, random_walks, skills
+from tipl.checks import NULL, random_walks, run_like, skills
 from tipl.errors import ForecastError, ModelError, RepresentationError, TrainError
 from tipl.models.causal import CausalGPT
 from tipl.refit import RefitConfig, refit_of
@@ -72,6 +72,17 @@ def test_early_starts_are_copied(runs: list[wt.Run]) -> None:
     assert not np.array_equal(forecast[1, 0], runs[0].weights[3])
 
 
+def test_where_the_path_rests_it_is_copied(runs: list[wt.Run], tmp_path: Path) -> None:
+    weights = runs[0].weights[:]
+    rests = np.concatenate([weights[:10], np.repeat(weights[10:11], 30, axis=0)])
+    flat = np.repeat(weights[:1], 20, axis=0)
+    with np.errstate(all="raise"):
+        later = lively_causal().forecast(run_like(runs[0], rests, tmp_path), [38], [1])
+        early = lively_causal().forecast(run_like(runs[0], flat, tmp_path), [10], [1])
+    assert np.array_equal(later[0, 0], weights[10])
+    assert np.array_equal(early[0, 0], weights[0])
+
+
 def test_the_error_that_is_learnt_is_that_of_the_weights(
     runs: list[wt.Run], config: CausalTrainConfig
 ) -> None:
@@ -126,6 +137,9 @@ def test_what_does_not_fit_is_refused(
         train_causal(replace(config, out=tmp_path / "a", horizons=(1, 100)))
     with pytest.raises(RepresentationError, match="a rank from 1 to 29"):
         train_causal(replace(config, out=tmp_path / "b", rank=40))
+    with pytest.raises(TrainError, match="n_embd a multiple of n_head"):
+        train_causal(replace(config, out=tmp_path / "c", n_head=3))
+    assert not (tmp_path / "c").exists()
     trained.save(tmp_path / "copy")
     (tmp_path / "copy/model.safetensors").write_bytes(b"damaged")
     with pytest.raises(ModelError, match="cannot be loaded"):

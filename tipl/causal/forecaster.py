@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from tipl.baselines.files import ARRAYS, load_network, read_config, write
 from tipl.baselines.horizons import rows_of
 from tipl.causal.view import SCALE_STEPS, bases_of, local_scale, view
+from tipl.errors import RepresentationError
 from tipl.forecast import Pushed, check_cadence, check_request
 from tipl.models.causal import CausalConfig, CausalGPT
 from tipl.structure import Clock
@@ -35,8 +36,8 @@ class CausalModelConfig:
 class Causal(Pushed):
     """tipl-causal: phi_t and a displacement within the directions of the path up to t.
 
-    Before the path has as many directions as the basis, it is persistence. Its error is at least
-    the part of the true displacement that leaves the path's directions.
+    Before the path has as many directions as the basis, and where it rests, it is persistence. Its
+    error is at least the part of the true displacement that leaves the path's directions.
     """
 
     network: CausalGPT
@@ -57,7 +58,6 @@ class Causal(Pushed):
         Raises:
             ForecastError: it was not trained for such a horizon.
             ModelError: the run has another cadence, or longer iterations.
-            RepresentationError: the path does not move in enough directions.
         """
         check_request(run, starts, horizons)
         sizes = self.config.network
@@ -74,7 +74,13 @@ class Causal(Pushed):
                 bases = bases_of(run, sizes)
                 recent = run.weights[max(0, t - SCALE_STEPS) : t + 1].astype(np.float64)
                 scale = local_scale(recent)
-                seen = view(bases.tokens(t), t, scale, clock, sizes)
+                try:
+                    prefix = bases.tokens(t)
+                except RepresentationError:  # too few directions
+                    continue
+                if scale == 0:
+                    continue
+                seen = view(prefix, t, scale, clock, sizes)
                 moved = self.network(
                     seen.tokens[None], seen.phases[None], seen.mask[None], seen.state[None]
                 )[0, places]
