@@ -156,6 +156,7 @@ class TIPL(Pushed):
     config: TIPLConfig
     name: str = "tipl"
     """Name in tables and figures: of the folder that it was loaded from."""
+    kind = "tipl"
     causal = False
 
     def forecast(

@@ -454,6 +454,7 @@ def test_a_gate_is_released_with_its_data_sets(
     assert "datasets:\n- small\n- other\n" in text
     assert text.count("- learnt from: ") == 2
     assert "tipl train-gate --data small other --out FOLDER --horizons 1 5 --starts 20" in text
+    assert " --no-adam\n" in text
     assert "After 4 batches, the squared error over the copy's" in text
     assert (tmp_path / "cards/tipl-gate-small.svg").exists()
     assert listed("tipl-gate-small")[1:3] == ("gate", "yes")

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
+
+from tipl.errors import EvaluateError
 
 Row = dict[str, Any]
 """A figure: ``value``, its interval from ``low`` to ``high``, and ``h``; None: not known."""
@@ -13,10 +17,34 @@ SKILL = ("skill", "ratio_of_sums", "all")
 FUNCTION_SKILL = ("function_skill", "all")
 GAIN = ("gain", "held")
 REPW = ("repw", "sampled", "learning")
+MODELS = ("tipl", "gate", "causal", "drift")
+"""Kinds that are no baselines."""
 BEST = 3
 """So many baselines count as the best in weight error."""
 GAIN_HORIZON = 50
 """Gains are compared here, or at the largest horizon below."""
+
+
+def read_results(file: Path) -> dict[str, Any]:
+    """A result file of ``tipl evaluate``.
+
+    Raises:
+        EvaluateError: it is none.
+        FileNotFoundError: it is not there.
+    """
+    try:
+        document = json.loads(file.read_text())
+        known = {"forecasters", "data", "runs", "horizons"} <= document.keys()
+    except (ValueError, AttributeError):
+        known = False
+    if not known:
+        raise EvaluateError(
+            "the file holds no results",
+            expected="results.json, as `tipl evaluate` wrote it",
+            where=file,
+            do="name that file, or give the command of the evaluation again",
+        )
+    return dict(document)
 
 
 def rows_of(scores: dict[str, Any], path: Sequence[str]) -> list[Row]:
@@ -33,8 +61,12 @@ def row_at(scores: dict[str, Any], path: Sequence[str], h: int) -> Row | None:
 
 
 def models(results: dict[str, Any]) -> list[str]:
-    """The forecasters that begin with ``tipl``."""
-    return [name for name in results["forecasters"] if name.startswith("tipl")]
+    """The networks of this package; of what says no kind, what begins with ``tipl``."""
+    return [
+        name
+        for name, scores in results["forecasters"].items()
+        if (kind in MODELS if (kind := scores.get("kind")) else name.startswith("tipl"))
+    ]
 
 
 def floors(results: dict[str, Any]) -> list[str]:
@@ -87,6 +119,7 @@ __all__ = [
     "floors",
     "gain_horizon",
     "models",
+    "read_results",
     "row_at",
     "rows_of",
     "that_matter",

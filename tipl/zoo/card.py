@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from tipl.errors import ModelError
 from tipl.report.figures import svg
 from tipl.report.markdown import rewrite, table_lines
-from tipl.report.scores import COPY, floors, row_at, rows_of
+from tipl.report.scores import COPY, MODELS, floors, row_at, rows_of
 from tipl.report.tables import COLUMNS, cell, headline, label
 from tipl.report.verdict import verdict
 from tipl.zoo import lookup
@@ -187,7 +187,7 @@ def _ladder(metrics: Metrics) -> str:
     own = metrics.results | {
         "forecasters": {n: metrics.results["forecasters"][n] for n in (COPY, metrics.judged_as)}
     }
-    told = verdict(own) if metrics.judged_as.startswith("tipl") else ""
+    told = verdict(own) if metrics.kind in MODELS else ""
     note = (
         "95 % intervals: bootstrap over runs; what another training would give is not in them. "
         "Skill: 0 is the copy of the last weights, 1 the truth. Of the baselines the best ones are "
@@ -318,6 +318,8 @@ def _commands(metrics: Metrics) -> str:
 
 def _option(setting: tuple[str, Any]) -> str:
     key, value = setting
+    if isinstance(value, bool):
+        return f"--{'' if value else 'no-'}{key.replace('_', '-')}"
     values = value if isinstance(value, list) else [value]
     return f"--{key.replace('_', '-')} {' '.join(map(str, values))}"
 

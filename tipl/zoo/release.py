@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,7 +29,16 @@ import weighttraj as wt
 from tipl import baselines
 from tipl.errors import ModelError
 from tipl.evaluation.parts import fingerprint
-from tipl.report.scores import FUNCTION_SKILL, GAIN, REPW, SKILL, floors, rows_of, that_matter
+from tipl.report.scores import (
+    FUNCTION_SKILL,
+    GAIN,
+    REPW,
+    SKILL,
+    floors,
+    read_results,
+    rows_of,
+    that_matter,
+)
 from tipl.zoo import lookup
 from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics, write_metrics
 
@@ -92,9 +102,13 @@ def release(
         known = read_metrics(out)
         if known is not None and known.fingerprint != mark:
             known = None  # of a model that was released before
-        metrics = known
+        metrics, checked = known, known.checks if known else None
+        if checks is not None:
+            checked = _checks(checks, mark, name)
+        if known is not None:
+            metrics = replace(known, checks=checked)
         if results is not None:
-            document = json.loads(results.read_text())
+            document = read_results(results)
             judged_as = _find(document, mark, name, results)
             metrics = Metrics(
                 name=name,
@@ -104,7 +118,7 @@ def release(
                 judged_as=judged_as,
                 results=reduced(document, judged_as),
                 **_training(folder, known, log),
-                checks=_checks(checks, mark, name) if checks else known.checks if known else None,
+                checks=checked,
             )
         shutil.copytree(draft, out, dirs_exist_ok=True)
     if metrics is None:
@@ -135,7 +149,9 @@ def reduced(results: dict[str, Any], judged_as: str) -> dict[str, Any]:
     chosen = {judged_as, *that_matter(results), *floors(results)}
     forecasters = {
         name: {
-            key: scores[key] for key in ("causal", "floor", "wpe", "repw_ratio") if key in scores
+            key: scores[key]
+            for key in ("kind", "causal", "floor", "wpe", "repw_ratio")
+            if key in scores
         }
         | _nested(scores)
         for name, scores in results["forecasters"].items()
