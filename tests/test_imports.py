@@ -265,6 +265,7 @@ ALLOWED = {
     ],
     "weighttraj": [FORMAT, "weighttraj.remote"],
     "tipl.errors": ["weighttraj.errors"],
+    "tipl.settings": ["weighttraj.errors"],
     "tipl.representation": ["tipl.errors", "tipl.representation", "door weighttraj"],
     "tipl.models": ["tipl.models"],
     "tipl.tokens": ["tipl.errors", "tipl.representation"],
@@ -277,6 +278,7 @@ ALLOWED = {
         "later tipl.zoo.remote",
     ],
     "tipl.baselines": [
+        "tipl.settings",
         "tipl.baselines",
         "tipl.errors",
         "tipl.forecast",
@@ -285,6 +287,7 @@ ALLOWED = {
         "tipl.threads",
     ],
     "tipl.gate": [
+        "tipl.settings",
         "tipl.baselines.files",
         "tipl.baselines.horizons",
         "tipl.baselines.trajectory",
@@ -298,6 +301,7 @@ ALLOWED = {
         "tipl.threads",
     ],
     "tipl.drift": [
+        "tipl.settings",
         "tipl.threads",
         "weighttraj.progress",
         "tipl.baselines.files",
@@ -314,6 +318,8 @@ ALLOWED = {
         "door weighttraj",
     ],
     "tipl.causal": [
+        "tipl.settings",
+        "tipl.errors",
         "tipl.baselines.files",
         "tipl.baselines.horizons",
         "tipl.baselines.trajectory",
@@ -328,6 +334,7 @@ ALLOWED = {
     ],
     "tipl.structure": ["tipl.models.gate", "door weighttraj"],
     "tipl.learn": [
+        "tipl.settings",
         "tipl.threads",
         "weighttraj.progress",
         "tipl.baselines.horizons",
@@ -339,6 +346,8 @@ ALLOWED = {
     ],
     "tipl.checks": ["tipl.errors", "tipl.forecast", "door weighttraj"],
     "tipl.refit": [
+        "tipl.settings",
+        "tipl.errors",
         "tipl.baselines",
         "tipl.checks",
         "tipl.evaluation.parts",
@@ -363,6 +372,7 @@ ALLOWED = {
     "tipl.threads": [],
     "tipl.step": ["tipl.distributed", "tipl.errors", "tipl.models", "tipl.tokens"],
     "tipl.train": [
+        "tipl.settings",
         "tipl.threads",
         "tipl.distributed",
         "tipl.errors",
@@ -376,6 +386,7 @@ ALLOWED = {
     ],
     "tipl.report": ["tipl.errors", "tipl.report"],
     "tipl.evaluation": [
+        "tipl.settings",
         "tipl.threads",
         "weighttraj.progress",
         "tipl.baselines",

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
-from tipl.errors import RepresentationError
+from tipl.errors import ForecastError, RepresentationError
 from tipl.forecast import Forecaster
 from weighttraj import ParamLayout, Run, RunWriter, open_run
 
@@ -38,6 +38,8 @@ NULL = 0.02
 TOLERANCE = 1e-3
 """Largest error, relative to the displacement, that passes. Float32 keeps a weight of 0.5 to 3e-8,
 a step of 1e-4 thus to 3e-4; sums in another order differ by less."""
+WALK = 300
+"""Snapshots of a random walk."""
 GRID = 2.0**-20
 """Weights of test runs are multiples of this, so that float32 holds sums and doubles exactly."""
 
@@ -98,6 +100,13 @@ def check(
     Raises:
         ForecastError: it makes no forecast of such runs, or for such horizons.
     """
+    if max(horizons) > WALK // 2:
+        raise ForecastError(
+            "the random walks are too short for such a horizon",
+            expected=f"horizons of at most {WALK // 2}",
+            got=max(horizons),
+            do="choose smaller --horizons",
+        )
     walks = random_walks(run, folder, count=count, seed=seed)
     walker = forecaster if fit is None else fit(walks[2:])
     last = len(run) - 1 - max(horizons)
@@ -239,7 +248,7 @@ def _drift_or_none(*arguments: Any, seed: int) -> float | None:
 
 
 def random_walks(
-    run: Run, folder: Path, *, count: int = 4, length: int = 300, seed: int = 0
+    run: Run, folder: Path, *, count: int = 4, length: int = WALK, seed: int = 0
 ) -> list[Run]:
     """Runs whose steps are independent and normal: nothing in them can be forecast."""
     walks = []

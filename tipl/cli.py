@@ -30,6 +30,7 @@ try:
     from tipl.prepare import digest_of
     from tipl.refit import check_model
     from tipl.report import tables
+    from tipl.report.scores import read_results
     from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
     from tipl.zoo.card import HEADLINE, listed, write_card
@@ -163,6 +164,8 @@ def _check(
     Whether it finds something in random walks, looks ahead, follows permuted and flipped units and
     longer steps, and goes on along a line.
     """
+    if out.is_dir():
+        raise IsADirectoryError(f"--out {out} is a folder: name a JSON file")
     found = check_model(
         tipl.load(model),
         data,
@@ -246,7 +249,7 @@ def _report(
     ] = None,
 ) -> None:
     """Write the page and figures of a result file again, or its places in a Markdown page."""
-    document = json.loads(results.read_text())
+    document = read_results(results)
     if into is not None:
         report.insert_markdown(document, results, into)
         print(f"results in {into}")
@@ -292,7 +295,7 @@ def main() -> None:
 def _run() -> None:
     try:
         app.cli(prog="tipl", description="Forecasts of policy weights: train and judge models.")
-    except (WeightTrajError, FileNotFoundError) as error:
+    except (WeightTrajError, OSError) as error:
         console.print(f"[red]error:[/red] {escape(str(error))}")
         sys.exit(1)
 

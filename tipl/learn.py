@@ -27,6 +27,7 @@ from tipl.baselines.horizons import HORIZONS
 from tipl.errors import TrainError
 from tipl.prepare import digest_of
 from tipl.progress import TrainingBar
+from tipl.settings import check_settings
 from tipl.state import append_log, cut_log, keep_settings, read_log, read_state, restore, save_state
 from tipl.threads import threads
 from weighttraj.progress import LoggedProgress
@@ -83,6 +84,17 @@ class LearnConfig:
     seed: int = 0
     """Of starts, initialisation and batches."""
 
+    def check(self) -> None:
+        """Refuse numbers that make no training.
+
+        Raises:
+            TrainError: one is too small.
+        """
+        at_least_1 = ("horizons", "starts", "n_batches", "batch_size", "validate_every")
+        at_least_0 = ("learning_rate", "weight_decay", "grad_clip", "seed")
+        least = dict.fromkeys(at_least_1, 1) | dict.fromkeys(at_least_0, 0)
+        check_settings(vars(self), least, TrainError)
+
 
 class Learner(ABC, Generic[E]):
     """A network, and how it learns."""
@@ -121,9 +133,10 @@ def learn(
         console: where progress is shown; None: nowhere.
 
     Raises:
-        TrainError: the data sets have no runs to train on, or different cadences; or the folder
-            holds a training with other settings.
+        TrainError: the data sets have no runs to train on, or different cadences; a number is too
+            small; or the folder holds a training with other settings.
     """
+    config.check()
     with threads(), torch.random.fork_rng(devices=[]):
         _Training(config, build, console or Console(quiet=True)).run()
 

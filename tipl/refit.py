@@ -20,9 +20,11 @@ from tipl.baselines.nowcaster import Nowcaster
 from tipl.causal import Causal, CausalTrainConfig, train_causal
 from tipl.checks import NULL, TOLERANCE, Fit, adam_of, check, run_like
 from tipl.drift import Drift
+from tipl.errors import ForecastError
 from tipl.evaluation.parts import fingerprint
 from tipl.forecast import TIPL, Forecaster
 from tipl.gate import Gate, GateTrainConfig, train_gate
+from tipl.settings import check_settings
 from tipl.train import TrainConfig, train
 from weighttraj import Run
 from weighttraj.format import DatasetInfo, RunEntry
@@ -72,7 +74,13 @@ def check_model(
 
     Returns:
         JSON: what was measured, how, and what passed.
+
+    Raises:
+        ForecastError: it makes no such forecast, or a number is too small or too large.
     """
+    numbers = {"horizons": horizons, "batches": batches, "walks": walks, "seed": seed}
+    least = {"horizons": 1, "batches": 1, "walks": 3, "seed": 0}
+    check_settings(numbers, least, ForecastError)
     dataset = wt.open_dataset(data)
     run = dataset.split("test").runs[0]
     with tempfile.TemporaryDirectory() as place:

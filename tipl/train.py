@@ -15,6 +15,7 @@ from tipl.forecast import TIPL, TIPLConfig
 from tipl.models.gpt import GPT, GPTConfig
 from tipl.prepare import Prepared, prepare
 from tipl.progress import TrainingBar
+from tipl.settings import check_heads, check_settings
 from tipl.state import append_log, cut_log, keep_settings, read_state, restore, save_state
 from tipl.step import StepConfig, Stepper, weight_prediction_error
 from tipl.threads import threads
@@ -117,14 +118,17 @@ def _train(config: TrainConfig, ranks: Ranks, console: Console) -> TIPL:
 
 
 def _check_sizes(config: TrainConfig) -> None:
-    at_least_1 = ("rank", "n_batches", "batch_size", "block_size", "n_layer", "n_head", "n_embd")
-    sizes = {name: getattr(config, name) for name in (*at_least_1, "save_every", "threads")}
-    if min(sizes.values()) < 1 or config.n_embd % config.n_head or not 0 <= config.dropout < 1:
+    sizes = ("rank", "n_batches", "batch_size", "block_size", "n_layer", "n_head", "n_embd")
+    rates = ("learning_rate", "weight_decay", "warmup", "grad_clip", "dropout", "seed")
+    least = dict.fromkeys((*sizes, "save_every", "threads"), 1) | dict.fromkeys(rates, 0)
+    check_settings(vars(config), least, TrainError)
+    check_heads(config.n_embd, config.n_head, TrainError)
+    if config.dropout >= 1:
         raise TrainError(
-            "these sizes make no training",
-            expected="sizes of at least 1, n_embd a multiple of n_head, dropout from 0 to below 1",
-            got=", ".join(f"{k} {v}" for k, v in (sizes | {"dropout": config.dropout}).items()),
-            do="change what does not fit",
+            "a dropout of all makes no training",
+            expected="dropout below 1",
+            got=config.dropout,
+            do="choose a smaller --dropout",
         )
 
 

@@ -13,6 +13,7 @@ import torch
 import weighttraj as wt
 from tests.small import SMALL_RECIPE
 from tipl import EvaluateConfig, Persistence, Reconstruction, TrainConfig, evaluate, load, train
+from tipl.checks import run_like
 from tipl.errors import EvaluateError
 from tipl.evaluation import measure
 from tipl.evaluation.parts import Parts, fingerprint
@@ -30,6 +31,7 @@ from tipl.evaluation.weights import squared_errors
 from tipl.report import verdict
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
+from weighttraj.format import DatasetInfo, RunEntry
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import ReturnsConfig, fill_returns
 from weighttraj.policies import evaluate as play
@@ -392,7 +394,7 @@ def test_the_verdict_is_plain(skills: tuple[float, float], said: str) -> None:
 
 def test_runs_that_are_too_short_are_refused(data: Path, tmp_path: Path) -> None:
     config = EvaluateConfig(data=data, out=tmp_path, **SMALL | {"horizons": (49,)})
-    with pytest.raises(EvaluateError, match="more than 50 snapshots"):
+    with pytest.raises(EvaluateError, match="--horizons of at most 24"):
         evaluate([], config)
 
 
@@ -401,6 +403,52 @@ def test_horizons_beyond_half_a_run_are_left_out(data: Path, tmp_path: Path) -> 
     found = evaluate([], EvaluateConfig(data=data, out=tmp_path, **small))
     assert found["horizons"] == [1, 24]
     assert "gain" not in found["forecasters"]["persistence"]
+
+
+def test_runs_of_different_lengths_are_judged_together(data: Path, tmp_path: Path) -> None:
+    run = unseen(data)
+    shorter = run_like(run, run.weights[:40], tmp_path / "data/runs")
+    longer = run_like(run, run.weights[:], tmp_path / "data/runs")
+    entries = [
+        RunEntry(id=one.id, path=f"runs/{one.path.name}", split="test") for one in (shorter, longer)
+    ]
+    info = DatasetInfo(id="uneven", runs=tuple(entries), status="complete")
+    write_dataset_info(tmp_path / "data", info)
+    few = SMALL | {"learning_starts": 0, "function_starts": 0}
+    trend = load("trend-5")
+    found = evaluate([trend], EvaluateConfig(data=tmp_path / "data", out=tmp_path, **few))
+    error, copy = np.zeros(3), np.zeros(3)
+    for one in (shorter, longer):
+        starts = np.arange(len(one) - 3)
+        true = one.weights[:].astype(np.float64)[starts[:, None] + np.array([1, 2, 3])]
+        error += ((trend.forecast(one, starts.tolist(), [1, 2, 3]) - true) ** 2).sum((0, 2))
+        copy += ((one.weights[:][starts][:, None] - true) ** 2).sum((0, 2))
+    rows = found["forecasters"]["trend-5"]["skill"]["ratio_of_sums"]["all"]
+    np.testing.assert_allclose([row["value"] for row in rows], 1 - error / copy, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"horizons": ()}, "horizons empty"),
+        ({"horizons": (0,)}, "horizons 0"),
+        ({"starts": 0}, "starts of at least 1"),
+        ({"bootstrap": 0}, "bootstrap 0"),
+        ({"return_horizons": (5000,)}, "--return-horizons of at most 24"),
+    ],
+)
+def test_impossible_settings_are_refused_before_anything_is_measured(
+    data: Path, tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    config = EvaluateConfig(data=data, out=tmp_path / "out", **SMALL | change)
+    with pytest.raises(EvaluateError, match=message):
+        evaluate([], config)
+    assert not config.out.exists()
+
+
+def test_a_quick_look_keeps_a_horizon() -> None:
+    config = EvaluateConfig(data="", out=Path(), quick=True, return_horizons=(20,))
+    assert config.bounded().return_horizons == (20,)
 
 
 def test_runs_without_returns_are_refused(small_dataset: Path, tmp_path: Path) -> None:

@@ -392,6 +392,16 @@ def test_other_settings_are_refused(trained: Gate, config: GateTrainConfig) -> N
     assert train_gate(config).config == trained.config
 
 
+@pytest.mark.parametrize("setting", ["validate_every", "n_batches", "starts", "width"])
+def test_impossible_settings_leave_no_folder(
+    config: GateTrainConfig, tmp_path: Path, setting: str
+) -> None:
+    settings = replace(config, out=tmp_path / "model", **{setting: 0})
+    with pytest.raises(TrainError, match=f"{setting} of at least 1"):
+        train_gate(settings)
+    assert not settings.out.exists()
+
+
 def test_run_like_keeps_what_the_clock_reads(runs: list[wt.Run], tmp_path: Path) -> None:
     made = run_like(runs[0], runs[0].weights[:20], tmp_path)
     ours, theirs = Clock.of(made), Clock.of(runs[0])

@@ -181,8 +181,10 @@ def test_a_longer_training_is_not_passed_off_as_a_shorter_one(config: TrainConfi
     ("change", "message"),
     [
         ({"n_head": 3}, "n_embd a multiple of n_head"),
-        ({"save_every": 0}, "sizes of at least 1(.|\n)*save_every 0"),
-        ({"dropout": 1.0}, "dropout from 0 to below 1"),
+        ({"seed": -1}, "seed of at least 0"),
+        ({"learning_rate": -1.0}, "learning_rate of at least 0"),
+        ({"save_every": 0}, "save_every of at least 1(.|\n)*save_every 0"),
+        ({"dropout": 1.0}, "dropout below 1"),
         ({"block_size": 50}, "block_size at most 49"),
         ({"rank": 50}, "run seed0000 has no such coefficients"),
         ({"device": "xpu:9"}, "choose another --device"),

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from tipl.baselines.files import read_config, write
+from tipl.errors import ForecastError
 from tipl.forecast import check_request
 from tipl.representation import embed
 from weighttraj import Run
@@ -36,8 +37,19 @@ class Reconstruction:
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """phi_{t+h} projected to the first d directions of the run."""
+        """phi_{t+h} projected to the first d directions of the run.
+
+        Raises:
+            ForecastError: the run ends before.
+        """
         check_request(run, starts, horizons)
+        if max(starts) + max(horizons) >= len(run):
+            raise ForecastError(
+                "the truth is not known so far ahead",
+                expected=f"start and horizon of at most {len(run) - 1} together",
+                got=max(starts) + max(horizons),
+                where=run.path,
+            )
         embedded = embed(run, self.rank)
         later = np.asarray(starts)[:, None] + np.asarray(horizons)
         back = embedded.svd.inverse_transform(embedded.coefficients[later])

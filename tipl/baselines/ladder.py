@@ -19,8 +19,9 @@ from tipl.baselines.regression import RegressionFit
 from tipl.baselines.steps import Ema, Slope, Steps
 from tipl.baselines.subspace import DMD, ProjectedSteps
 from tipl.baselines.trajectory import samples
-from tipl.errors import ForecastError
+from tipl.errors import ForecastError, TrainError
 from tipl.forecast import Forecaster
+from tipl.settings import check_settings
 from weighttraj import Run
 
 _BETAS = (0.9, 0.95, 0.98)
@@ -78,8 +79,11 @@ def fit_ladder(
         training: how the small networks are trained; None: as they are by default.
 
     Raises:
-        TrainError: the runs are too short.
+        TrainError: the runs are too short, or a number is too small.
     """
+    numbers = {"horizons": tuple(horizons), "seed": seed, **vars(training or TrainingConfig())}
+    least = {"horizons": 1, "seed": 0, "steps": 1, "batch_size": 1}
+    check_settings(numbers, least, TrainError)
     say = progress or (lambda _: None)
     config = NowcasterConfig(horizons=fitted(horizons))
     rungs: list[tuple[Features, bool]] = [

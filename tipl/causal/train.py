@@ -18,6 +18,7 @@ from tipl.baselines.horizons import fitted
 from tipl.baselines.trajectory import columns_of, stratified
 from tipl.causal.forecaster import Causal, CausalModelConfig
 from tipl.causal.view import SCALE_STEPS, View, bases_of, local_scale, view
+from tipl.errors import TrainError
 from tipl.learn import (
     LearnConfig,
     Learner,
@@ -28,6 +29,7 @@ from tipl.learn import (
     too_short,
 )
 from tipl.models.causal import CausalConfig, CausalGPT
+from tipl.settings import check_heads, check_settings
 from tipl.structure import Clock, Structure
 
 POOL = 4096
@@ -54,6 +56,13 @@ class CausalTrainConfig(LearnConfig):
     """Attention heads."""
     n_embd: int = 64
     """Width of the stream."""
+
+    def check(self) -> None:
+        """As of every training, and sizes of the network."""
+        super().check()
+        sizes = ("rank", "window", "block_size", "n_layer", "n_head", "n_embd")
+        check_settings(vars(self), dict.fromkeys(sizes, 1), TrainError)
+        check_heads(self.n_embd, self.n_head, TrainError)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,7 @@ from tipl.evaluation.starts import starts_of
 from tipl.forecast import Forecaster
 from tipl.gate import Gate
 from tipl.prepare import digest_of
+from tipl.settings import check_settings
 from tipl.state import keep_settings
 from tipl.threads import threads
 from weighttraj.progress import LoggedProgress
@@ -76,6 +77,8 @@ def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift
     """
     from tipl.zoo.lookup import load
 
+    numbers = dict.fromkeys(("horizons", "starts", "episodes"), 1) | {"seed": 0}
+    check_settings(vars(config), numbers, TrainError)
     along, horizons = load(config.along), fitted(config.horizons)
     if isinstance(along, Gate):
         rows_of(along.config.network.horizons, horizons, along.name)
@@ -170,6 +173,7 @@ def _check(config: DriftConfig, runs: Sequence[wt.Run]) -> None:
             "there are no amplitudes to choose from",
             expected="factors above 0",
             got=config.amplitudes,
+            do="choose other --amplitudes",
         )
 
 

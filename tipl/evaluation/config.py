@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from tipl.errors import EvaluateError
+from tipl.settings import check_settings
+
 HORIZONS = (*range(1, 11), 20, 50, 100, 200)
 """Snapshots ahead, as the results report them."""
 
@@ -42,14 +45,24 @@ class EvaluateConfig:
     """Fewer starts, episodes and horizons: minutes instead of hours."""
 
     def bounded(self) -> EvaluateConfig:
-        """These settings, smaller if ``quick``."""
+        """These settings, smaller if ``quick``.
+
+        Raises:
+            EvaluateError: a number is too small, or no horizon is named.
+        """
+        least = dict.fromkeys(("horizons", "starts", "episodes", "bootstrap"), 1)
+        least |= dict.fromkeys(("function_starts", "learning_starts", "plateau_starts", "seed"), 0)
+        if self.learning_starts:
+            least["return_horizons"] = 1
+        check_settings(vars(self), least, EvaluateError)
         if not self.quick:
             return self
+        quick = tuple(h for h in self.return_horizons if h in (1, 10, 50))
         return replace(
             self,
             starts=min(self.starts, 300),
             function_starts=min(self.function_starts, 50),
-            return_horizons=tuple(h for h in self.return_horizons if h in (1, 10, 50)),
+            return_horizons=quick or self.return_horizons[:1],
             learning_starts=min(self.learning_starts, 2),
             plateau_starts=min(self.plateau_starts, 1),
             episodes=min(self.episodes, 5),

@@ -58,12 +58,10 @@ def evaluate(
     runs = dataset.split(config.split).runs
     _check_runs(runs, config)
     half = min(len(run) for run in runs) // 2
-    config = replace(
-        config,
-        horizons=tuple(h for h in config.horizons if h <= half) or config.horizons[:1],
-        return_horizons=tuple(h for h in config.return_horizons if h <= half)
-        or config.return_horizons[:1],
-    )
+    config = replace(config, horizons=_up_to(half, config.horizons, "--horizons"))
+    if config.learning_starts:
+        within = _up_to(half, config.return_horizons, "--return-horizons")
+        config = replace(config, return_horizons=within)
     copy = Persistence()
     ranks = sorted({f.config.gpt.rank for f in forecasters if isinstance(f, TIPL)})
     floors = (Reconstruction(rank) for rank in ranks)
@@ -94,6 +92,7 @@ def evaluate(
         "noise_floor": summary.noise() if config.learning_starts else {},
         "forecasters": {
             f.name: {
+                "kind": getattr(f, "kind", None),
                 "causal": f.causal,
                 "floor": is_floor(f),
                 "fingerprint": fingerprint(f),
@@ -107,6 +106,18 @@ def evaluate(
     (config.out / "results.json").write_text(json.dumps(results, indent=1))
     write_report(results, config.out)
     return results
+
+
+def _up_to(half: int, horizons: Sequence[int], option: str) -> tuple[int, ...]:
+    found = tuple(h for h in horizons if h <= half)
+    if not found:
+        raise EvaluateError(
+            "the runs are too short to be forecast so far",
+            expected=f"{option} of at most {half}, half of the shortest run",
+            got=" ".join(map(str, horizons)),
+            do=f"choose smaller {option}, or collect longer runs",
+        )
+    return found
 
 
 def _env_steps_of(run: wt.Run) -> float:

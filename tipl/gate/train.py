@@ -13,10 +13,12 @@ from torch import Tensor
 
 import weighttraj as wt
 from tipl.baselines.horizons import fitted
+from tipl.errors import TrainError
 from tipl.gate.examples import GateExamples, gather
 from tipl.gate.forecaster import Gate, GateModelConfig
 from tipl.learn import LearnConfig, Learner, Tell, cadence_of, learn
 from tipl.models.gate import GateConfig, GateNetwork, Input
+from tipl.settings import check_settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +35,11 @@ class GateTrainConfig(LearnConfig):
     """Zeros instead of these inputs, to learn what they are worth."""
     adam: bool = False
     """It sees Adam's moments too, which the runs must store."""
+
+    def check(self) -> None:
+        """As of every training, and sizes of the network."""
+        super().check()
+        check_settings(vars(self), dict.fromkeys(("lags", "width", "experts"), 1), TrainError)
 
 
 def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
