@@ -11,9 +11,11 @@ import pytest
 import weighttraj as wt
 
 
-def run(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+def run(
+    program: str, *arguments: object, answers: str | None = None
+) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", f"{program}.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False, input=answers)
 
 
 @pytest.mark.parametrize(

@@ -282,9 +282,18 @@ def _delete(
     yes: Annotated[bool, tyro.conf.arg(help="do not ask")] = False,
 ) -> None:
     """Remove a data set from this machine. There is no way back."""
-    if not yes and not Confirm.ask(f"remove {name} and all its runs from this machine?"):
+    place = registry.find(name).path
+    if not yes and not _sure(f"remove {name}, all in {place}, from this machine?"):
         raise SystemExit(1)
     print(f"removed {registry.delete(name)}")
+
+
+def _sure(question: str) -> bool:
+    try:
+        return Confirm.ask(question)
+    except EOFError:  # nobody is there to be asked
+        print("not removed: give --yes where nobody can be asked")
+        return False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -240,10 +240,29 @@ def test_a_full_disk_leaves_nothing_behind(store: Path, disk: Path) -> None:
 
 
 def test_a_deleted_data_set_is_gone(store: Path) -> None:
-    assert delete("below") == store / "below"
-    assert not list(store.glob("*below*"))
+    (store / "below/thesis.tex").touch()
+    assert delete("below") == store / "below/data"
+    assert [path.name for path in (store / "below").iterdir()] == ["thesis.tex"]
     assert delete("team/theirs") == store / "team/theirs"
-    assert {"small", "notes", "team"} == {path.name for path in store.iterdir()}
+    assert {"small", "notes", "team", "below"} == {path.name for path in store.iterdir()}
+
+
+def test_what_lies_beside_a_data_set_called_data_stays(
+    small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(small_dataset, project / "data")
+    (project / "thesis.tex").touch()
+    monkeypatch.setenv(VARIABLE, str(project))
+    assert delete("data") == project / "data"
+    assert [path.name for path in project.iterdir()] == ["thesis.tex"]
+    # Where `data` is a folder of data sets too, it is not one that is deleted.
+    shutil.copytree(small_dataset, project / "data")
+    shutil.copytree(small_dataset, project / "data/other")
+    monkeypatch.chdir(project)
+    with pytest.raises(RegistryError, match="other data sets have their ids"):
+        delete("data")
+    assert (project / "data/other").is_dir()
 
 
 def test_what_must_stay_is_not_deleted(store: Path) -> None:
@@ -270,5 +289,9 @@ def test_the_commands(store: Path, tmp_path: Path) -> None:
     done = shell("weighttraj", "split", "small", "--out", tmp_path / "new", "--seed", 3)
     assert done.returncode == 0
     assert len(wt.open(tmp_path / "new")) == 4
+    unasked = shell("weighttraj", "delete", "small", answers="")
+    assert unasked.returncode == 1
+    assert "give --yes" in unasked.stdout
+    assert str(store / "small") in unasked.stdout.replace("\n", "")
     assert shell("weighttraj", "delete", "small", "--yes").returncode == 0
     assert not (store / "small").exists()

@@ -9,7 +9,7 @@ from weighttraj.registry.card import write_card
 from weighttraj.registry.derive import combine, create, split
 from weighttraj.registry.download import download
 from weighttraj.registry.load import load_dataset
-from weighttraj.registry.local import LocalDataset, delete, local_datasets
+from weighttraj.registry.local import LocalDataset, delete, find, local_datasets
 from weighttraj.registry.search import search
 from weighttraj.registry.upload import upload
 
@@ -19,6 +19,7 @@ __all__ = [
     "create",
     "delete",
     "download",
+    "find",
     "load_dataset",
     "local_datasets",
     "search",

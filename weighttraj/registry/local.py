@@ -53,19 +53,14 @@ def local_datasets() -> list[LocalDataset]:
     return sorted(found.values(), key=lambda dataset: dataset.id)
 
 
-def delete(name: str) -> Path:
-    """Remove a data set that is named by its id; of a clone's own nothing is removed.
-
-    It gets a hidden name first, so that nobody opens a half of it. There is no way back.
-
-    Returns:
-        Where it lay.
+def find(name: str) -> LocalDataset:
+    """A data set by its id here.
 
     Raises:
         FileNotFoundError: there is no such data set.
-        RegistryError: the name is a path, or the data set belongs to the clone.
+        RegistryError: the name is a path.
     """
-    known = {dataset.id: dataset.path for dataset in local_datasets()}
+    known = {dataset.id: dataset for dataset in local_datasets()}
     if name not in known:
         locate(name)  # says where was looked
         raise RegistryError(
@@ -74,19 +69,40 @@ def delete(name: str) -> Path:
             got=name,
             do="remove a folder of your own yourself",
         )
-    path = known[name]
+    return known[name]
+
+
+def delete(name: str) -> Path:
+    """Remove a data set that is named by its id; of a clone's own nothing is removed.
+
+    It gets a hidden name first, so that nobody opens a half of it. There is no way back. Of a data
+    set in ``ID/data`` only ``data`` is removed: what lies beside it may be anything.
+
+    Returns:
+        Where it lay.
+
+    Raises:
+        FileNotFoundError: there is no such data set.
+        RegistryError: the name is a path, or the data set belongs to the clone.
+    """
+    path = find(name).path
     if (own := clone()) is not None and path.is_relative_to(own):
         raise RegistryError(
             "the data sets of a clone are not deleted",
             where=path,
             do="they belong to the repository; delete the clone, if you must",
         )
+    if any(folder.resolve().is_relative_to(path.resolve()) for folder in folders()):
+        raise RegistryError(
+            "other data sets have their ids in this folder, so it is not deleted as one",
+            where=path,
+            do="remove what you mean yourself",
+        )
     open_dataset(path)  # a folder that only looks like a data set is left alone
-    top = path.parent if path.name == "data" else path
-    hidden = top.with_name(f".{top.name}.{os.getpid()}.deleted")
-    top.rename(hidden)
+    hidden = path.with_name(f".{path.name}.{os.getpid()}.deleted")
+    path.rename(hidden)
     shutil.rmtree(hidden)
-    return top
+    return path
 
 
 def _names(folder: Path) -> Iterator[str]:
