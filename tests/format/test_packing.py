@@ -24,7 +24,7 @@ from tests.format.test_store import INFO, write
 from weighttraj.errors import DamageError, FormatError
 from weighttraj.format import ParamLayout, RunInfo, RunWriter
 from weighttraj.format.objects import ZipObjects
-from weighttraj.format.packing import same_as_packed
+from weighttraj.format.packing import cut, same_as_packed
 from weighttraj.format.storage import RunStore, group_document, member_documents
 
 PROFILES = ("default", "archive")
@@ -50,6 +50,19 @@ def test_packing_keeps_every_array_bit_by_bit(tmp_path: Path, profile: str) -> N
     for name, array in run.arrays.items():
         assert packed[name][:].tobytes() == array[:].tobytes(), name
     assert wt.verify(path) == []
+
+
+def test_a_path_that_ends_in_a_slash_is_the_same(tmp_path: Path) -> None:
+    run = write(tmp_path / "run.zarr")
+    assert wt.pack(f"{run.path}/") == tmp_path / "run.zarr.zip"
+
+
+def test_a_part_of_a_run_that_says_no_iterations(tmp_path: Path) -> None:
+    run = wide(tmp_path / "run.zarr", 30, 5)
+    assert run.iteration[:].tolist() == [-1] * 30
+    part = wt.open_run(cut(run.path, tmp_path / "part.zarr.zip", steps=(10, 19)))
+    np.testing.assert_array_equal(part.weights[:], run.weights[10:20])
+    assert wt.verify(part.path) == []
 
 
 @pytest.mark.parametrize("profile", PROFILES)

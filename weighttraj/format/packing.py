@@ -59,7 +59,7 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
             where=path,
             do="pip install --upgrade weighttraj, so that nothing is lost",
         )
-    target = Path(out or str(path).removesuffix(PACKED) + PACKED)
+    target = Path(out or str(Path(path)).removesuffix(PACKED) + PACKED)
     _write(source, replace(source.info, profile=profile), slice(0, source.info.n_committed), target)
     return target
 
@@ -107,7 +107,9 @@ def cut(
         )
     info = _without(source.info, GROUPS - set(arrays)) if arrays is not None else source.info
     last = int(source.read("index/iteration", stop - 1))
-    iterations = min(info.n_committed_iterations, last)
+    iterations = info.n_committed_iterations
+    if last >= 0:  # else the run does not say to which iteration a snapshot belongs
+        iterations = min(iterations, last)
     info = replace(info, n_committed=stop - start, n_committed_iterations=iterations)
     _write(source, info, slice(start, stop), out)
     return out
