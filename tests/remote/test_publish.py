@@ -28,6 +28,7 @@ from weighttraj.errors import (
     StoreExistsError,
     StoreLockedError,
 )
+from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo, RunWriter
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.registry.download import source_of
 from weighttraj.registry.upload import CLAIM
@@ -76,6 +77,18 @@ def test_another_upload_is_not_disturbed(bucket: Bucket, published: Path, large:
     assert list(objects_of(bucket)) == [CLAIM]
     wt.upload(large, bucket.address)  # whose claim it is
     assert objects_of(bucket) == files_of(large)
+
+
+def test_what_lies_there_from_before_is_written_over(bucket: Bucket, published: Path) -> None:
+    """Whoever takes back the list of runs publishes anew; sizes say nothing of what lies there."""
+    wt.upload(published, bucket.address)
+    store = store_at(bucket.address)
+    for name in ("dataset.json", "MANIFEST.sha256"):
+        store.delete(name)
+    readme = (published / "README.md").read_bytes()
+    store.write("README.md", readme[::-1])
+    wt.upload(published, bucket.address)
+    assert objects_of(bucket) == files_of(published)
 
 
 def test_two_publishers_at_once(bucket: Bucket, published: Path, large: Path) -> None:
@@ -210,6 +223,35 @@ def test_some_runs(server: servers.FileServer, tmp_path: Path, published: Path) 
     assert not any("seed0003" in request.path for request in server.log)
 
 
+def test_some_runs_that_are_folders(tmp_path: Path) -> None:
+    folder = tmp_path / "folders"
+    entries = tuple(RunEntry(id=i, path=f"runs/{i}.zarr", split="train") for i in ("a", "b"))
+    layout = ParamLayout.of({"w": ((3,), "other", ("fixed",))})
+    for entry in entries:
+        with RunWriter(folder / entry.path, RunInfo(run_id=entry.id, layout=layout)) as writer:
+            writer.append(np.ones(3, np.float32), num_timesteps=0)
+    write_dataset_info(folder, DatasetInfo(id="folders", runs=entries, status="complete"))
+    wt.seal(folder)
+    dataset = wt.download(folder.as_uri(), tmp_path / "part", runs=["b"])
+    assert [run.id for run in dataset] == ["b"]
+    assert not (tmp_path / "part/runs/a.zarr").exists()
+    assert wt.verify(dataset.path, deep=True) == []
+
+
+def test_what_was_cut_for_another_request_is_not_kept(large: Path, tmp_path: Path) -> None:
+    first = wt.download(large.as_uri(), tmp_path / "first", steps=(0, 20_000))
+    other = first.runs[0].path.name
+    for name, asked in {"steps": {"steps": (40_000, 60_000)}, "whole": {"arrays": []}}.items():
+        draft = tmp_path / f".{name}.download"  # as it is left by a process that is killed
+        (draft / "runs").mkdir(parents=True)
+        shutil.copy(first.runs[0].path, draft / "runs" / other)
+        found = wt.download(large.as_uri(), tmp_path / name, **asked)
+        straight = wt.download(large.as_uri(), tmp_path / f"{name}-straight", **asked)
+        for one, two in zip(found, straight, strict=True):
+            np.testing.assert_array_equal(one.num_timesteps, two.num_timesteps)
+        assert files_of(Path(found.path)) == files_of(Path(straight.path))
+
+
 def test_some_steps_and_arrays(
     large_server: servers.FileServer, large: Path, tmp_path: Path
 ) -> None:
@@ -235,6 +277,8 @@ def test_a_part_that_is_none(large_server: servers.FileServer, tmp_path: Path) -
         wt.download(address, tmp_path / "b", steps=(10**9, 10**10))
     with pytest.raises(RegistryError, match="no such run"):
         wt.download(address, tmp_path / "c", runs=["seed0099"])
+    with pytest.raises(RegistryError, match="no run was named"):
+        wt.download(address, tmp_path / "d", runs=[])
 
 
 def test_it_goes_on_where_it_was_stopped(

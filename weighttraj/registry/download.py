@@ -8,7 +8,7 @@ import json
 import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -23,7 +23,7 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
-from weighttraj.errors import DamageError, FormatError, RemoteError, StoreLockedError
+from weighttraj.errors import DamageError, FormatError, RegistryError, RemoteError, StoreLockedError
 from weighttraj.format import Dataset, RunEntry, open_dataset, seal
 from weighttraj.format.catalog import (
     MANIFEST,
@@ -40,6 +40,8 @@ from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
 
+REQUEST = ".request.json"
+"""File in a download that is not whole yet: which part of the runs it is of."""
 SOURCE = ".source.json"
 """File in a downloaded data set that says where it is from; no object of the data set."""
 TRIES = 5
@@ -93,6 +95,14 @@ def download(
         RemoteError: it cannot be reached; what came is kept.
     """
     place = RemotePath.parse(address, revision)
+    if runs is not None and not runs:
+        raise RegistryError(
+            "no run was named",
+            expected="ids of runs",
+            got="an empty list",
+            where=place,
+            do="name some; without a list all come",
+        )
     dataset = open_dataset(place, runs=runs)
     assert isinstance(dataset.path, RemotePath)  # noqa: S101
     store, at = store_at(dataset.path.root), dataset.path
@@ -107,12 +117,14 @@ def download(
     refuse_existing(target)
     draft = target.with_name(f".{target.name}.download")
     with _kept(draft):
+        _go_on(draft, _request(content, steps, arrays))
         if steps is None and arrays is None:
             chosen = {entry.path for entry in _entries(dataset)} if part else None
-            wanted = [line for line in lines if chosen is None or line.path in chosen]
+            wanted = [line for line in lines if chosen is None or _is_of(line, chosen)]
             _fetch_all(store, at, wanted, draft, console or Console(quiet=True))
         else:
             _cut_all(dataset, draft, steps, arrays, console or Console(quiet=True))
+        (draft / REQUEST).unlink(missing_ok=True)
         if part:
             _list_part(dataset, draft, steps, arrays)
         else:
@@ -258,6 +270,32 @@ def _append(
             else:
                 break
     return digest.hexdigest()
+
+
+def _is_of(line: ManifestLine, chosen: set[str]) -> bool:
+    """Whether a file is one of these runs, or lies in one that is a folder."""
+    path = PurePosixPath(line.path)
+    return not chosen.isdisjoint(map(str, (path, *path.parents)))
+
+
+def _request(
+    manifest: bytes, steps: tuple[int, int] | None, arrays: Collection[str] | None
+) -> bytes | None:
+    """What runs are cut for, and of what; None: they come as they are, and hashes tell them."""
+    if steps is None and arrays is None:
+        return None
+    asked = {"steps": steps, "arrays": None if arrays is None else sorted(arrays)}
+    return json.dumps(asked | {"manifest": hashlib.sha256(manifest).hexdigest()}).encode()
+
+
+def _go_on(draft: Path, request: bytes | None) -> None:
+    """Keep what came, unless it was for another request."""
+    file = draft / REQUEST
+    if (file.read_bytes() if file.is_file() else None) != request:
+        shutil.rmtree(draft)
+        draft.mkdir()
+    if request is not None:
+        replace_file(file, request)
 
 
 def _cut_all(

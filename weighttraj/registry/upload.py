@@ -155,21 +155,23 @@ def upload_folder(
             raise _immutable(place)
         return
     lines = [line for line in read_manifest(folder) if line.path != last]
-    _send_all(store, folder, lines, console or Console(quiet=True))
+    _send_all(store, folder, lines, claimed, console or Console(quiet=True))
     for name in dict.fromkeys((MANIFEST, last)):
         store.write(name, folder / name)
     store.delete(CLAIM)
 
 
 def _send_all(
-    store: RemoteStore, folder: Path, lines: list[ManifestLine], console: Console
+    store: RemoteStore, folder: Path, lines: list[ManifestLine], anew: bool, console: Console
 ) -> None:
+    """Write files that are not there; anew: all, whatever lies there from before."""
     columns = (TextColumn("upload"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
         task = progress.add_task("upload", total=sum(line.size for line in lines))
 
         def send(line: ManifestLine) -> None:
-            if store.size(line.path) != line.size:  # an object is there as a whole or not at all
+            # An object is there as a whole or not at all.
+            if anew or store.size(line.path) != line.size:
                 store.write(line.path, folder / line.path)
             progress.advance(task, line.size)
 
