@@ -63,6 +63,10 @@ def measure(data: Path, h: int, starts: int, episodes: int) -> dict[str, Any]:
             name: bootstrap.interval(mean, values.mean(1, keepdims=True))[0]
             for name, values in arrays.items()
         },
+        "added": {
+            name: bootstrap.interval(mean, (values - arrays[NOW]).mean(1, keepdims=True))[0]
+            for name, values in arrays.items()
+        },
         "gain": {
             name: bootstrap.interval(
                 ratio_of_sums, values.sum(1, keepdims=True) - now, later - now
@@ -73,13 +77,17 @@ def measure(data: Path, h: int, starts: int, episodes: int) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Mean returns and gains, best forecasts first."""
+    """Mean returns and gains, best forecasts first.
+
+    A gain has no interval: in some resamples PPO itself gains nothing to divide by.
+    """
     names = sorted(result["gain"], key=lambda name: -result["gain"][name]["value"])
     names = [NOW, LATER, *(name for name in names if name not in (NOW, LATER))]
-    lines = ["| policy | mean return | inference gain |", "|---|---:|---:|"]
+    lines = ["| policy | mean return | added to phi_t | inference gain |", "|---|---:|---:|---:|"]
     for name in names:
-        gain = "" if name in (NOW, LATER) else _told(result["gain"][name], 2)
-        lines.append(f"| {name} | {_told(result['return'][name], 0)} | {gain} |")
+        added = "" if name == NOW else _told(result["added"][name], 0)
+        gain = "" if name in (NOW, LATER) else f"{result['gain'][name]['value']:.2f}"
+        lines.append(f"| {name} | {_told(result['return'][name], 0)} | {added} | {gain} |")
     told = (
         f"`{result['data']}`, test runs {', '.join(result['runs'])}: {result['starts']} starts in "
         f"the first half of each, h = {result['h']} ({result['env_steps']:,.0f} environment steps "
@@ -102,7 +110,7 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("data", type=Path, nargs="?", help="half-cheetah-v4-ppo-v1, collected")
     options.add_argument("--h", type=int, default=100)
-    options.add_argument("--starts", type=int, default=10)
+    options.add_argument("--starts", type=int, default=24)
     options.add_argument("--episodes", type=int, default=10)
     args = options.parse_args()
     if args.data:
