@@ -34,6 +34,7 @@ try:
     from tipl.report.tables import cell, headline
     from tipl.train import TrainConfig
     from tipl.zoo.card import HEADLINE, listed, write_card
+    from tipl.zoo.metrics import read_metrics
     from tipl.zoo.release import release
 except WeightTrajError as error:
     sys.exit(f"error: {error}")
@@ -209,7 +210,7 @@ def _release(
     """Put a model into the zoo: once as a draft, and with its results after it was judged there."""
     out = release(folder, name, results=results, checks=checks, log=log)
     print(f"model in {out}")
-    if results is None:
+    if read_metrics(out) is None:
         print(f"a draft: judge it with `tipl evaluate {name} ...`, then give --results")
 
 
