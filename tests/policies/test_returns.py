@@ -18,8 +18,10 @@ from filelock import FileLock
 from rich.console import Console
 
 import weighttraj as wt
+from tipl.checks import run_like
 from weighttraj.engine import Tell
 from weighttraj.errors import EngineError, FormatError, PolicyError, StoreLockedError
+from weighttraj.format import RunEntry
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
 from weighttraj.policies.returns import play_rows
@@ -157,12 +159,52 @@ def test_a_journal_that_was_cut_short_is_used_as_far_as_it_goes(
     with pytest.raises(KeyboardInterrupt):
         fill_returns(dataset, CONFIG)
     journal = dataset / ".returns" / "seed0000.jsonl"
-    assert [json.loads(line)["t"] for line in journal.read_text().split("\n")[1:5]] == ROWS[:4]
+    lines = [line.partition(" ")[2] for line in journal.read_text().split("\n")]
+    assert [json.loads(line)["t"] for line in lines[1:5]] == ROWS[:4]
     journal.write_bytes(journal.read_bytes()[:-3])
     played = _count(monkeypatch)
     fill_returns(dataset, CONFIG)
     assert played[:2] == [ROWS[3:5], ROWS[5:]]
     assert wt.verify(dataset) == []
+
+
+@pytest.mark.parametrize("damage", [('"returns": [', '"returns": [9'), ('"t"', '"u"'), ("1", "2")])
+def test_a_damaged_journal_never_becomes_a_return(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch, damage: tuple[str, str]
+) -> None:
+    straight = stored(fill_returns(dataset, CONFIG).path)
+    fill_returns(dataset, replace(CONFIG, seed=7), replace=True)  # so that there is all to do again
+    monkeypatch.setattr(returns, "BLOCK", 2)
+    _stop_after(monkeypatch, 2)
+    with pytest.raises(KeyboardInterrupt):
+        fill_returns(dataset, CONFIG, replace=True)
+    journal = dataset / ".returns" / "seed0000.jsonl"
+    header, first, second, *rest = journal.read_text().splitlines(keepends=True)
+    journal.write_text("".join([header, first, second.replace(*damage, 1), *rest]))
+    _count(monkeypatch)  # and does not stop it any more
+    fill_returns(dataset, CONFIG, replace=True)
+    assert stored(dataset) == straight
+
+
+def test_returns_of_a_folder_are_refused_before_anything_is_played(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run, *_) = wt.open(dataset).runs
+    made = run_like(run, run.weights[:], dataset / "runs")
+    folder, info = Path(made.path), read_dataset_info(dataset)
+    entry = RunEntry(id=made.id, path=f"runs/{folder.name}", split="train")
+    (dataset / "MANIFEST.sha256").unlink()
+    write_dataset_info(dataset, replace(info, runs=(entry,), status="collecting"))
+    fill_returns(dataset, CONFIG)
+    played = _count(monkeypatch)
+    more = replace(CONFIG, every=10)
+    with pytest.raises(PolicyError, match=r"(?s)those of a folder are not replaced.*remove its"):
+        fill_returns(dataset, more)
+    assert not played
+    wt.pack(folder)  # as it says
+    shutil.rmtree(folder)
+    fill_returns(dataset, more)
+    assert np.isfinite(wt.open(dataset).runs[0]["eval/returns"][10]).all()
 
 
 def test_a_journal_of_other_settings_is_not_used(

@@ -154,7 +154,7 @@ def _has_already(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray
             expected="a run without returns, or a packed one",
             got=store.info.evaluation,
             where=store.path,
-            do="pack the run (weighttraj.pack), and store the returns in the file",
+            do="pack the run (weighttraj.pack), remove its folder, and store them in the file",
         )
     return True
 

@@ -11,6 +11,7 @@ import contextlib
 import importlib.metadata
 import json
 import os
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -175,6 +176,15 @@ class _Work:
         self.played = self._stored(replace=replace) | self._journal.rows
         self.unsaved = len(self._journal.rows)
         self.missing = [row for row in config.rows(len(run)) if row not in self.played]
+        packed = Path(run.path).suffix == PACKED
+        if self.missing and run.info.evaluation is not None and not packed:
+            raise PolicyError(
+                "the run has other returns, and those of a folder are not replaced",
+                expected="a run without returns, or a packed one",
+                got=run.info.evaluation,
+                where=run.path,
+                do="pack the run (weighttraj.pack), remove its folder, and give the command again",
+            )
 
     def begin(self) -> None:
         """Begin the journal; store what an earlier one holds, if that is all."""
@@ -238,7 +248,9 @@ class _Work:
 
 
 class _Journal:
-    """Snapshots that were played, one JSON line each; a line that a kill cut short is dropped.
+    """Snapshots that were played, a line of crc32 and JSON each.
+
+    A line that a kill cut short, or that is damaged, is dropped, and what follows it.
 
     Args:
         path: the file.
@@ -252,21 +264,23 @@ class _Journal:
     def begin(self) -> None:
         """Write it anew with the lines that hold."""
         self._path.parent.mkdir(exist_ok=True)
-        replace_file(self._path, f"{json.dumps(self._header)}\n".encode())
+        replace_file(self._path, _line(self._header).encode())
         self.append(self.rows)
 
     def _read(self, header: dict[str, Any]) -> _Played:
         if not self._path.is_file():
             return {}
         rows: _Played = {}
-        lines = self._path.read_text(errors="replace").split("\n")[:-1]
-        with contextlib.suppress(ValueError):  # what follows a damaged line is played again
-            if not lines or json.loads(lines[0]) != header:
-                return {}
-            for line in lines[1:]:
-                entry = json.loads(line)
-                returns = np.array([np.nan if x is None else x for x in entry["returns"]])
-                rows[entry["t"]] = (returns, np.array(entry["lengths"], np.int64))
+        first, *lines = self._path.read_text(errors="replace").splitlines(keepends=True) or [""]
+        if first != _line(header):
+            return {}
+        for line in lines:
+            text = line.partition(" ")[2].removesuffix("\n")
+            if line != _crc(text):  # what follows a damaged line is played again
+                break
+            entry = json.loads(text)
+            returns = np.array([np.nan if x is None else x for x in entry["returns"]])
+            rows[entry["t"]] = (returns, np.array(entry["lengths"], np.int64))
         return rows
 
     def append(self, rows: _Played) -> None:
@@ -275,7 +289,7 @@ class _Journal:
             for row, (returns, lengths) in rows.items():
                 numbers = [None if np.isnan(x) else float(x) for x in returns]
                 entry = {"t": row, "returns": numbers, "lengths": lengths.tolist()}
-                file.write(json.dumps(entry) + "\n")
+                file.write(_line(entry))
             file.flush()
             os.fsync(file.fileno())
 
@@ -284,6 +298,14 @@ class _Journal:
         self._path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self._path.parent.rmdir()
+
+
+def _line(entry: dict[str, Any]) -> str:
+    return _crc(json.dumps(entry))
+
+
+def _crc(text: str) -> str:
+    return f"{zlib.crc32(text.encode()):08x} {text}\n"
 
 
 def _finished(dataset: Dataset, console: Console) -> list[Run]:
