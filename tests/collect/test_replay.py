@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 import weighttraj as wt
 from weighttraj.collect import replay
@@ -29,6 +30,16 @@ def test_another_training_is_found_out(small_dataset: Path, tmp_path: Path) -> N
     (problem,) = replay(path, 9)
     assert "snapshot 1 of 9 is the first that differs" in problem
     assert "in the same circumstances" in problem
+    torch.set_num_threads(2)  # the run is trained again with its own number
+    try:
+        assert "in the same circumstances" in replay(path, 9)[0]
+    finally:
+        torch.set_num_threads(1)
+
+
+def test_no_snapshots_are_refused(small_dataset: Path) -> None:
+    with pytest.raises(CollectError, match="at least 1"):
+        replay(small_dataset, -5)
 
 
 def test_an_unknown_seed_is_refused(small_dataset: Path) -> None:

@@ -6,6 +6,7 @@ import io
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from rich.console import Console
 
 import weighttraj as wt
@@ -169,6 +171,21 @@ def test_collecting_again_does_nothing(tmp_path: Path) -> None:
     collect(one_seed(), out, console=Console(file=screen))
     assert "seed 0: complete, 49 snapshots" in screen.getvalue()
     assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
+
+
+def test_it_says_for_whom_it_waits(small_dataset: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(small_dataset, tmp_path / "disk/small")
+    data.symlink_to(tmp_path / "disk/small")  # one lock, by whatever name
+    said = Console(file=io.StringIO(), width=200)
+    waiting = threading.Thread(target=collect, args=(SMALL_RECIPE, data), kwargs={"console": said})
+    with FileLock(tmp_path / "disk/.small.lock"):
+        waiting.start()
+        waiting.join(5)
+        assert waiting.is_alive()
+        assert "waiting for another process" in said.file.getvalue()  # type: ignore[attr-defined]
+    waiting.join(60)
+    assert not waiting.is_alive()
 
 
 def test_seeds_can_be_added(tmp_path: Path) -> None:

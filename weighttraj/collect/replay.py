@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -37,6 +38,13 @@ def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
     Raises:
         CollectError: the data set has no recipe, or no run of this seed.
     """
+    if n < 1:
+        raise CollectError(
+            "there is nothing to train again",
+            expected="a number of snapshots of at least 1",
+            got=n,
+            do="choose how many",
+        )
     dataset = open_dataset(path)
     runs = [run for run in dataset if seed is None or run.info.seed == seed]
     if not runs or not dataset.info.recipe:
@@ -69,16 +77,21 @@ def _compare(run: Run, recipe: Recipe, n: int) -> list[str]:
     if len(again) == n and not differing.size:
         return []
     first = int(differing[0]) if differing.size else len(again)
-    reason = explain_difference(run.info.provenance, describe_provenance())
+    now = replace(describe_provenance(), threads=_threads(run))
+    reason = explain_difference(run.info.provenance, now)
     return [
         f"{run.path}: trained again, snapshot {first} of {n} is the first that differs; "
         f"stored {reason}"
     ]
 
 
+def _threads(run: Run) -> int:
+    return run.info.provenance.threads or 1
+
+
 def _train(run: Run, recipe: Recipe, n: int, path: Path) -> Run:
     threads = torch.get_num_threads()
-    torch.set_num_threads(run.info.provenance.threads or 1)
+    torch.set_num_threads(_threads(run))
     cadence = run.info.cadence
     steps = (cadence.gradient_steps_per_iteration if cadence else None) or 1
     iterations = math.ceil((n - 1) * recipe.store.every / steps)

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
@@ -71,18 +71,18 @@ def collect(
     console = console or Console(quiet=True)
     with engine_of(workers, scheduler) as engine:
         out.mkdir(parents=True, exist_ok=True)
-        with _lock(out):
+        with _lock(out, console):
             info = _prepare(recipe, out, seeds)
         entries = [run for run in info.runs if run.seed in wanted]
         tasks, failures = _plan(recipe, out, entries, console)
         failures += _run(tasks, engine, console)
-        with _lock(out):
+        with _lock(out, console):
             again = [
                 _start_over(out, task, error, console) for task, error in _mismatches(failures)
             ]
         failures = [f for f in failures if not isinstance(f[1], ReplayError)]
         failures += _run(again, engine, console)
-    with _lock(out):
+    with _lock(out, console):
         _settle(out)
     if failures:
         raise CollectError(
@@ -247,9 +247,20 @@ def _start_over(out: Path, task: Task, error: ReplayError, console: Console) -> 
     return replace(task, path=out / new.path)
 
 
-def _lock(out: Path) -> FileLock:
+@contextlib.contextmanager
+def _lock(out: Path, console: Console) -> Iterator[None]:
     """Held while ``dataset.json`` is read and written: several may collect into one data set."""
-    return FileLock(out.with_name(f".{out.name}.lock"))
+    place = out.resolve()  # as of who evaluates it
+    lock = FileLock(place.with_name(f".{place.name}.lock"))
+    try:
+        lock.acquire(timeout=1)
+    except Timeout:
+        console.print(f"waiting for another process, which is changing {out}: its returns, say")
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _settle(out: Path) -> None:
