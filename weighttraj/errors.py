@@ -48,6 +48,10 @@ class DamageError(FormatError):
     """Committed data is missing or its checksum is wrong."""
 
 
+class RowError(WeightTrajError, IndexError):
+    """Rows that an array does not have."""
+
+
 class StoreExistsError(WeightTrajError, FileExistsError):
     """The path to be written exists."""
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import weighttraj as wt
-from weighttraj.errors import DamageError
+from weighttraj.errors import DamageError, WeightTrajError
 
 
 def ids(dataset: wt.Dataset) -> list[str]:
@@ -29,6 +30,35 @@ def test_runs_are_selected_by_what_they_are(small_dataset: Path) -> None:
     assert [r.final_return for r in ds.select(final_return=lambda value: value >= best)] == [best]
     with pytest.raises(KeyError, match=r"no \['gama'\].*'gamma'"):
         ds.select(gama=0.5)
+
+
+def test_a_run_without_a_property_does_not_fit(small_dataset: Path, tmp_path: Path) -> None:
+    layout = wt.ParamLayout.of({"w": ((3,), "other", ("fixed",))})
+    with wt.RunWriter(tmp_path / "a.zarr", wt.RunInfo(run_id="a", layout=layout)) as writer:
+        writer.append(np.ones(3, np.float32), num_timesteps=0)
+    small = wt.open(small_dataset)
+    mixed = wt.Dataset(small.path, small.info, [*small.runs, wt.open_run(tmp_path / "a.zarr")])
+    assert len(mixed.select(n_epochs=lambda value: value > 0)) == len(small)
+    assert len(mixed.select(env=lambda name: name.startswith("Inv"))) == len(small)
+    assert [run.id for run in mixed.select(env=None)] == ["a"]
+
+
+def test_only_what_is_asked_for_is_read(small_dataset: Path, tmp_path: Path) -> None:
+    path = tmp_path / "small"
+    shutil.copytree(small_dataset, path)
+    (path / "runs/seed0003.zarr.zip").write_bytes(b"damaged")
+    assert [run.id for run in wt.open(path).select(id="seed0001")] == ["seed0001"]
+
+
+def test_rows_are_read_as_numpy_would(small_dataset: Path) -> None:
+    weights = wt.open(small_dataset).runs[0].weights
+    all_of_them = weights[:]
+    for key in (..., [], [3, -1], np.arange(49) % 2 == 0, slice(-5, None, 2), 7, np.int32(7)):
+        np.testing.assert_array_equal(weights[key], all_of_them[key])
+    for key in (slice(None, None, -1), [[1]], 49, [1.5], np.ones((49, 2), bool)):
+        with pytest.raises(IndexError, match="where") as caught:
+            weights[key]
+        assert isinstance(caught.value, WeightTrajError)
 
 
 def test_runs_are_found_by_id(small_dataset: Path) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from weighttraj.errors import DamageError, FormatError, RegistryError
+from weighttraj.errors import DamageError, FormatError, RegistryError, RowError
 from weighttraj.format.catalog import DATASET, parse_dataset, read_dataset_info
 from weighttraj.format.layout import ParamLayout
 from weighttraj.format.locate import locate
@@ -25,7 +25,7 @@ from weighttraj.format.schema import (
     RunEntry,
     RunInfo,
 )
-from weighttraj.format.storage import RunStore
+from weighttraj.format.storage import PACKED, RunStore
 from weighttraj.remote.address import Place, RemotePath, is_remote
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ class NormStats:
 class StoredArray:
     """One array of a run, read when it is indexed. Rows are the committed ones.
 
-    Slices and integers are read as numpy would; rows of ``policy/weights`` read whole are also
-    compared with the digests of their snapshots.
+    Integers, slices that go forward, lists of integers and masks are read as numpy would; rows of
+    ``policy/weights`` read whole are also compared with the digests of their snapshots.
     """
 
     def __init__(self, store: ArrayStore, spec: ArraySpec) -> None:
@@ -384,7 +384,7 @@ class Dataset:
             wanted: ``env``, ``algorithm``, ``seed``, ``split``, ``status``, ``id``,
                 ``final_return``, ``final_mean_return`` or a hyper-parameter such as
                 ``learning_rate``, each with the value it must have, a collection it must be in,
-                or a function that says whether a value will do.
+                or a function that says whether a value will do. A run without it does not fit.
 
         >>> ds.select(env="InvertedPendulum-v4", seed=range(10))  # doctest: +SKIP
         >>> ds.select(final_return=lambda value: value > 900, n_epochs=10)  # doctest: +SKIP
@@ -392,12 +392,13 @@ class Dataset:
         Raises:
             KeyError: no run knows of such a property.
         """
-        facts = [_facts(run) for run in self.runs]
-        known = sorted(set().union(*facts))
-        if self.runs and (unknown := sorted(wanted.keys() - set(known))):
-            raise KeyError(f"runs of {self.info.id} have no {unknown}; they have {known}")
-        pairs = zip(self.runs, facts, strict=True)
-        runs = [r for r, f in pairs if all(_fits(f.get(k), v) for k, v in wanted.items())]
+        if asked := wanted.keys() - _FACTS.keys():
+            known = _FACTS.keys() | set().union(*map(_hyperparameters, self.runs))
+            if self.runs and (unknown := sorted(asked - known)):
+                raise KeyError(
+                    f"runs of {self.info.id} have no {unknown}; they have {sorted(known)}"
+                )
+        runs = [run for run in self.runs if all(_has(run, k, v) for k, v in wanted.items())]
         return Dataset(self.path, self.info, runs)
 
     def to_torch(self, window: int = 20, *, stride: int = 1) -> WindowDataset:
@@ -480,6 +481,8 @@ def _open_folder(path: Path) -> Dataset:
     for entry in info.runs:
         objects.file(entry.path)  # refuses links: they could lead anywhere
         place = path / entry.path
+        if not place.exists() and (packed := place.with_name(place.name + PACKED)).is_file():
+            place = packed  # the folder became this file
         if place.is_file() or (place / "zarr.json").is_file():
             runs.append(Run(place, partial(RunStore.open, place), entry))
         elif info.status == "complete":
@@ -551,23 +554,34 @@ def open_run(path: str | Place) -> Run:
     return run
 
 
-def _facts(run: Run) -> dict[str, Any]:
-    """What ``select`` can ask of a run."""
-    info = run.info
-    hyperparameters = info.algorithm.hyperparameters if info.algorithm else {}
-    return hyperparameters | {
-        "id": run.id,
-        "split": run.split,
-        "seed": info.seed,
-        "status": info.status,
-        "env": info.env.id if info.env else None,
-        "algorithm": info.algorithm.name if info.algorithm else None,
-        "final_return": run.final_return,
-        "final_mean_return": run.final_mean_return,
-    }
+_FACTS: dict[str, Callable[[Run], Any]] = {
+    "id": lambda run: run.id,
+    "split": lambda run: run.split,
+    "seed": lambda run: run.info.seed,
+    "status": lambda run: run.info.status,
+    "env": lambda run: run.info.env.id if run.info.env else None,
+    "algorithm": lambda run: run.info.algorithm.name if run.info.algorithm else None,
+    "final_return": lambda run: run.final_return,
+    "final_mean_return": lambda run: run.final_mean_return,
+}
+"""What ``select`` can ask of a run, beside its hyper-parameters."""
+
+
+def _hyperparameters(run: Run) -> dict[str, Any]:
+    return run.info.algorithm.hyperparameters if run.info.algorithm else {}
+
+
+def _has(run: Run, name: str, wanted: Any) -> bool:
+    """Whether a run has a property that fits."""
+    if name in _FACTS:
+        return _fits(_FACTS[name](run), wanted)
+    values = _hyperparameters(run)
+    return name in values and _fits(values[name], wanted)
 
 
 def _fits(value: Any, wanted: Any) -> bool:
+    if value is None and callable(wanted):
+        return False
     if callable(wanted):
         return bool(wanted(value))
     if isinstance(wanted, list | tuple | set | frozenset | range):
@@ -577,16 +591,27 @@ def _fits(value: Any, wanted: Any) -> bool:
 
 def _rows(key: Any, n: int, where: str) -> Any:
     """A row selection with non-negative bounds inside the committed rows."""
+    if key is Ellipsis:
+        key = slice(None)
     if isinstance(key, slice):
         start, stop, step = key.indices(n)
         if step < 1:
-            raise IndexError(f"slices go forward only (step {step}) in {where}")
+            raise RowError("slices go forward only", got=f"step {step}", where=where)
         return slice(start, max(start, stop), step)
     index = np.asarray(key)
     if index.dtype == bool and index.shape == (n,):
         return np.flatnonzero(index)
-    if index.dtype.kind not in "iu" or ((index < -n) | (index >= n)).any():
-        raise IndexError(f"row {key!r} is not one of the {n} committed rows of {where}")
+    if not index.size and index.ndim == 1:
+        index = index.astype(np.int64)
+    whole = index.dtype.kind in "iu" and index.ndim <= 1
+    if not whole or ((index < -n) | (index >= n)).any():
+        raise RowError(
+            "there are no such rows",
+            expected=f"some of the {n} committed rows: a number, a list of numbers, a slice, or a "
+            "mask of them all",
+            got=repr(key),
+            where=where,
+        )
     index = np.where(index < 0, index + n, index)
     return int(index) if index.ndim == 0 else index
 
