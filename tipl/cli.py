@@ -41,6 +41,7 @@ except WeightTrajError as error:
 
 app = tyro.extras.SubcommandApp()
 console = Console()
+errors = Console(stderr=True)
 _WIDE = 150
 """Characters that a table with intervals needs."""
 
@@ -297,7 +298,7 @@ def _run() -> None:
     try:
         app.cli(prog="tipl", description="Forecasts of policy weights: train and judge models.")
     except (WeightTrajError, OSError) as error:
-        console.print(f"[red]error:[/red] {escape(str(error))}")
+        errors.print(f"[red]error:[/red] {escape(str(error))}")
         sys.exit(1)
 
 

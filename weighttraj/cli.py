@@ -17,12 +17,13 @@ from rich.table import Table
 
 import weighttraj as wt
 from weighttraj import registry
-from weighttraj.errors import WeightTrajError
+from weighttraj.errors import RegistryError, WeightTrajError
 from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.remote import is_remote
 
 app = tyro.extras.SubcommandApp()
 console = Console()
+errors = Console(stderr=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,10 +175,17 @@ def _search(
     """Find runs of all data sets that are here, by their environment, return, hyper-parameters."""
     found = registry.search(query)
     table = Table(title=f"{len(found)} runs")
-    shown = [column for column in columns if column in found.columns]
+    shown = list(columns)
+    if len(found) and (unknown := [column for column in columns if column not in found.columns]):
+        raise RegistryError(
+            "the runs have no such columns",
+            expected=", ".join(found.columns),
+            got=", ".join(unknown),
+            do="choose among these",
+        )
     for column in shown:
         table.add_column(column, overflow="fold", no_wrap=column in ("dataset", "run_id"))
-    for row in found[shown].itertuples(index=False):
+    for row in found[shown].itertuples(index=False) if len(found) else ():
         table.add_row(*(escape(_text(value)) for value in row))
     console.print(table)
 
@@ -491,11 +499,11 @@ def main() -> None:
     """Run the command line; errors of ours are printed without a traceback."""
     try:
         app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
-    except (WeightTrajError, OSError) as error:
-        console.print(f"[red]error:[/red] {escape(str(error))}", style=None)
-        sys.exit(1)
     except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (WeightTrajError, OSError) as error:
+        errors.print(f"[red]error:[/red] {escape(str(error))}")
+        sys.exit(1)
     except KeyboardInterrupt:
         console.print("stopped; give the same command again to go on")
         sys.exit(130)

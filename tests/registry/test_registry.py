@@ -286,6 +286,10 @@ def test_the_commands(store: Path, tmp_path: Path) -> None:
     refused = shell("weighttraj", "search", "colour == 1")
     assert refused.returncode == 1
     assert "Traceback" not in refused.stderr + refused.stdout
+    unknown = shell("weighttraj", "search", "seed == 2", "--columns", "bogus")
+    assert unknown.returncode == 1
+    assert "no such columns" in unknown.stderr
+    assert unknown.stdout == ""
     done = shell("weighttraj", "split", "small", "--out", tmp_path / "new", "--seed", 3)
     assert done.returncode == 0
     assert len(wt.open(tmp_path / "new")) == 4

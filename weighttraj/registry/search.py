@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from weighttraj.errors import RegistryError, missing_extra
+from weighttraj.errors import DamageError, RegistryError, missing_extra
 from weighttraj.format import open_dataset
 from weighttraj.format.tables import RUNS, run_row
 from weighttraj.registry.local import LocalDataset, local_datasets
@@ -28,6 +28,7 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
         A row for each run: ``dataset``, and the columns of its table of runs.
 
     Raises:
+        DamageError: the table of a data set is damaged.
         RegistryError: the query cannot be understood, or names what no run has.
         MissingExtraError: pandas or pyarrow is not installed.
     """
@@ -40,11 +41,18 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
     for dataset in local_datasets() if datasets is None else datasets:
         file = dataset.path / RUNS
         # A data set that is still being collected has no table yet.
-        table = (
-            pd.read_parquet(file)
-            if file.is_file()
-            else pd.DataFrame([run_row(run) for run in open_dataset(dataset.path)])
-        )
+        if file.is_file():
+            try:
+                table = pd.read_parquet(file)
+            except (OSError, ValueError) as error:  # pyarrow's are such
+                raise DamageError(
+                    "the table of a data set's runs cannot be read",
+                    got=error,
+                    where=file,
+                    do="restore it from a copy, or give the data set another place",
+                ) from error
+        else:
+            table = pd.DataFrame([run_row(run) for run in open_dataset(dataset.path)])
         table.insert(0, "dataset", dataset.id)
         if len(table):
             tables.append(table.dropna(axis="columns", how="all"))

@@ -246,6 +246,21 @@ def store_at(root: str) -> RemoteStore:
     return RemoteStore(root)
 
 
+def _patience() -> float:
+    """Seconds for which a server that does not answer is asked again."""
+    told = os.environ.get(TIMEOUT, "60")
+    try:
+        return float(told)
+    except ValueError as error:
+        raise RemoteError(
+            "the time to wait for a server is no number",
+            expected="seconds",
+            got=told,
+            where=f"environment variable {TIMEOUT}",
+            do="set it to a number, or unset it",
+        ) from error
+
+
 def _client(root: str) -> ObjectStore:
     try:
         from obstore.store import HTTPStore, from_url
@@ -259,7 +274,7 @@ def _client(root: str) -> ObjectStore:
     }
     retries: Any = {
         "max_retries": 100,
-        "retry_timeout": timedelta(seconds=float(os.environ.get(TIMEOUT, 60))),
+        "retry_timeout": timedelta(seconds=_patience()),
         "backoff": {
             "init_backoff": timedelta(milliseconds=100),
             "max_backoff": timedelta(seconds=5),
