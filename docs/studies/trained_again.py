@@ -1,13 +1,13 @@
 """Do the commands on the cards make the models of the zoo again?
 
 python docs/studies/trained_again.py --out FOLDER NAME [NAME ...]   # train, judge, render
+python docs/studies/trained_again.py --seeds 1 2 --beside NAME ...  # with other seeds too
 python docs/studies/trained_again.py                                # render what was measured
 
 Runs the commands of each card, judges what they made as the card's model was judged, and keeps both
 in trained_again.json. Trainings that stopped go on. HalfCheetah's runs have to be collected first,
 and another CPU makes other runs under the same seeds: with --beside, the zoo's models are judged on
-those that are here too. Writes the table in trained_again.md, beside
-this file.
+those that are here too. Writes the tables in trained_again.md, beside this file.
 """
 
 from __future__ import annotations
@@ -57,11 +57,15 @@ JUDGED = {
 }
 
 
-def make(name: str, out: Path) -> Path:
-    """Run the commands of a card; returns the folder of what they made."""
+def make(name: str, out: Path, seed: int | None = None) -> Path:
+    """Run the commands of a card, with another seed if one is given; returns what they made."""
     card = (ROOT / f"cards/models/{name}.md").read_text()
     commands = re.findall(r"^tipl (?:train|fit).*$", card, re.MULTILINE)
-    folders = {"GATE": out / f"{name}-gate", "FOLDER": out / name}
+    named = name
+    if seed is not None:
+        commands = [re.sub(r"--seed \d+", f"--seed {seed}", command) for command in commands]
+        named = f"{name}-seed-{seed}"
+    folders = {"GATE": out / f"{named}-gate", "FOLDER": out / named}
     for command in commands:
         words = [str(folders.get(word, word)) for word in shlex.split(command)]
         run(words)
@@ -76,13 +80,20 @@ def run(words: list[str]) -> None:
     subprocess.run([Path(sys.executable).with_name(words[0]), *words[1:]], check=True)  # noqa: S603
 
 
-def measure(names: list[str], out: Path, beside: bool, workers: int) -> dict[str, Any]:
+def measure(
+    names: list[str], out: Path, beside: bool, seeds: list[int], workers: int
+) -> dict[str, Any]:
     """Figures of models of one data set: the zoo's, and those of what was made again."""
-    made = {name: make(name, out) for name in names}
+    again = {name: make(name, out) for name in names}
+    seeded = {(name, seed): make(name, out, seed) for name in names for seed in seeds}
     metrics = {name: found for name in names if (found := read_metrics(ZOO / name))}
     (data,) = {one.results["data"] for one in metrics.values()}
     judging = JUDGED[data]
-    results = judge(list(made.values()), data, judging, out / f"report-{data}", workers)
+    results = judge(list(again.values()), data, judging, out / f"report-{data}", workers)
+    scores = results["forecasters"]
+    if seeds:
+        folder = out / f"report-{data}-seeds"
+        scores |= judge(list(seeded.values()), data, judging, folder, workers)["forecasters"]
     if beside:
         zoo = [ZOO / name for name in names]
         known = judge(zoo, data, judging, out / f"report-{data}-zoo", workers)["forecasters"]
@@ -92,13 +103,16 @@ def measure(names: list[str], out: Path, beside: bool, workers: int) -> dict[str
         name: {
             figure: {
                 "zoo": at(known[name], path),
-                "again": at(results["forecasters"][made[name].name], path),
+                "again": at(scores[again[name].name], path),
+                "seeds": [at(scores[seeded[name, seed].name], path) for seed in seeds],
             }
             for figure, path in judging.figures.items()
         }
         for name in names
     }
-    return {data: {"runs": results["runs"], "beside": beside, "models": models}}
+    return {
+        data: {"runs": results["runs"], "beside": beside, "seeds": seeds, "models": models},
+    }
 
 
 def judge(models: list[Path], data: str, judging: Judging, out: Path, workers: int) -> Any:
@@ -123,7 +137,9 @@ def table(measured: dict[str, Any]) -> str:
     return "\n\n".join(_table(data, **found) for data, found in measured.items())
 
 
-def _table(data: str, runs: list[str], beside: bool, models: dict[str, Any]) -> str:
+def _table(
+    data: str, runs: list[str], beside: bool, seeds: list[int], models: dict[str, Any]
+) -> str:
     figures = JUDGED[data].figures
     lines = [
         f"## {data}",
@@ -131,12 +147,17 @@ def _table(data: str, runs: list[str], beside: bool, models: dict[str, Any]) -> 
         "| model | " + " | ".join(figures) + " |",
         "|---|" + "---:|" * len(figures),
     ]
-    lines += [
-        f"| {name} | " + " | ".join(_told(**found[figure]) for figure in figures) + " |"
-        for name, found in models.items()
-    ]
+    for name, found in models.items():
+        cells = [found[figure] for figure in figures]
+        lines.append(f"| {name} | " + " | ".join(map(_told, cells)) + " |")
+        lines += [
+            f"| with seed {seed} | "
+            + " | ".join(f"{cell['seeds'][k]['value']:.{_digits(cell)}f}" for cell in cells)
+            + " |"
+            for k, seed in enumerate(seeds)
+        ]
     every = [cell for found in models.values() for cell in found.values()]
-    inside = sum(_inside(**cell) for cell in every)
+    inside = sum(_inside(cell) for cell in every)
     known = "the interval of the zoo's model on the same runs" if beside else "the card's interval"
     told = (
         f"What was trained again, judged on {len(runs)} test runs, and behind it {known}. "
@@ -145,13 +166,22 @@ def _table(data: str, runs: list[str], beside: bool, models: dict[str, Any]) -> 
     return "\n".join([*lines, "", told])
 
 
-def _inside(zoo: Interval, again: Interval) -> bool:
-    return zoo["low"] <= again["value"] <= zoo["high"]
+def _inside(cell: dict[str, Any]) -> bool:
+    return bool(cell["zoo"]["low"] <= cell["again"]["value"] <= cell["zoo"]["high"])
 
 
-def _told(zoo: Interval, again: Interval) -> str:
-    bold = "" if _inside(zoo, again) else "**"
-    return f"{bold}{again['value']:.2f}{bold} [{zoo['low']:.2f}, {zoo['high']:.2f}]"
+def _digits(cell: dict[str, Any]) -> int:
+    """As many as show how wide the zoo's interval is."""
+    return 2 if cell["zoo"]["high"] - cell["zoo"]["low"] > 0.01 else 3
+
+
+def _told(cell: dict[str, Any]) -> str:
+    bold, digits = "" if _inside(cell) else "**", _digits(cell)
+    value, low, high = (
+        f"{number:.{digits}f}"
+        for number in (cell["again"]["value"], cell["zoo"]["low"], cell["zoo"]["high"])
+    )
+    return f"{bold}{value}{bold} [{low}, {high}]"
 
 
 STUDY = Study(__file__, table)
@@ -167,10 +197,11 @@ def main() -> None:
         action="store_true",
         help="judge the zoo's models too: the test runs here are not those of the cards",
     )
+    options.add_argument("--seeds", type=int, nargs="*", default=[], help="of further trainings")
     options.add_argument("--workers", type=int, default=2)
     args = options.parse_args()
     if args.names:
-        found = measure(args.names, args.out, args.beside, args.workers)
+        found = measure(args.names, args.out, args.beside, args.seeds, args.workers)
         STUDY.keep((STUDY.measured() or {}) | found)
     STUDY.render()
 
