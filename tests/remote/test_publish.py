@@ -91,6 +91,21 @@ def test_what_lies_there_from_before_is_written_over(bucket: Bucket, published: 
     assert objects_of(bucket) == files_of(published)
 
 
+def test_what_lies_there_from_before_is_not_taken_for_begun(
+    bucket: Bucket, published: Path
+) -> None:
+    store = store_at(bucket.address)
+    store.write("README.md", (published / "README.md").read_bytes()[::-1])
+    store.write(CLAIM, (published / "MANIFEST.sha256").read_bytes())  # and stopped there
+    time.sleep(1.1)  # an S3 server's clock counts seconds
+    store.write("tables/runs.parquet", published / "tables/runs.parquet")
+    before = store.stat("tables/runs.parquet")
+    time.sleep(1.1)
+    wt.upload(published, bucket.address)
+    assert objects_of(bucket) == files_of(published)
+    assert store.stat("tables/runs.parquet") == before  # what came since the claim stays
+
+
 def test_two_publishers_at_once(bucket: Bucket, published: Path, large: Path) -> None:
     """One of them wins, and what it published is whole."""
     outcomes: list[object] = []

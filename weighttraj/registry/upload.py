@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -155,23 +156,29 @@ def upload_folder(
             raise _immutable(place)
         return
     lines = [line for line in read_manifest(folder) if line.path != last]
-    _send_all(store, folder, lines, claimed, console or Console(quiet=True))
+    claim = None if claimed else store.stat(CLAIM)
+    _send_all(store, folder, lines, claim and claim[1], console or Console(quiet=True))
     for name in dict.fromkeys((MANIFEST, last)):
         store.write(name, folder / name)
     store.delete(CLAIM)
 
 
 def _send_all(
-    store: RemoteStore, folder: Path, lines: list[ManifestLine], anew: bool, console: Console
+    store: RemoteStore,
+    folder: Path,
+    lines: list[ManifestLine],
+    since: datetime | None,
+    console: Console,
 ) -> None:
-    """Write files that are not there; anew: all, whatever lies there from before."""
+    """Write files that did not come since the claim; None: all, whatever lies there."""
     columns = (TextColumn("upload"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
         task = progress.add_task("upload", total=sum(line.size for line in lines))
 
         def send(line: ManifestLine) -> None:
-            # An object is there as a whole or not at all.
-            if anew or store.size(line.path) != line.size:
+            # An object is there as a whole or not at all; some servers' clocks count seconds.
+            there = since and store.stat(line.path)
+            if not (since and there and there[0] == line.size and there[1] > since):
                 store.write(line.path, folder / line.path)
             progress.advance(task, line.size)
 

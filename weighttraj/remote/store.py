@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -92,12 +92,18 @@ class RemoteStore:
 
     def size(self, name: str) -> int | None:
         """Bytes of an object; None: there is none."""
+        there = self.stat(name)
+        return None if there is None else there[0]
+
+    def stat(self, name: str) -> tuple[int, datetime] | None:
+        """Bytes of an object, and when it was written; None: there is none."""
         import obstore
 
         try:
-            return int(self._told(name, lambda: obstore.head(self._client, name))["size"])
+            there = self._told(name, lambda: obstore.head(self._client, name))
         except FileNotFoundError:
             return None
+        return there["size"], there["last_modified"]
 
     def pieces(self, name: str, start: int = 0) -> Iterator[bytes]:
         """An object from a byte on, some bytes at a time, as they arrive.
