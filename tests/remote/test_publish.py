@@ -238,19 +238,41 @@ def test_some_runs(server: servers.FileServer, tmp_path: Path, published: Path) 
     assert not any("seed0003" in request.path for request in server.log)
 
 
-def test_some_runs_that_are_folders(tmp_path: Path) -> None:
-    folder = tmp_path / "folders"
+def folders(path: Path, snapshots: int) -> Path:
+    """A data set whose runs are not packed."""
     entries = tuple(RunEntry(id=i, path=f"runs/{i}.zarr", split="train") for i in ("a", "b"))
     layout = ParamLayout.of({"w": ((3,), "other", ("fixed",))})
     for entry in entries:
-        with RunWriter(folder / entry.path, RunInfo(run_id=entry.id, layout=layout)) as writer:
-            writer.append(np.ones(3, np.float32), num_timesteps=0)
-    write_dataset_info(folder, DatasetInfo(id="folders", runs=entries, status="complete"))
-    wt.seal(folder)
+        info = RunInfo(run_id=entry.id, layout=layout, block=2)
+        with RunWriter(path / entry.path, info) as writer:
+            for t in range(snapshots):
+                writer.append(np.full(3, t, np.float32), num_timesteps=t)
+    (path / "README.md").write_text("# Folders\n")
+    write_dataset_info(path, DatasetInfo(id="folders", runs=entries, status="complete"))
+    wt.seal(path)
+    return path
+
+
+def test_some_runs_that_are_folders(tmp_path: Path) -> None:
+    folder = folders(tmp_path / "folders", 3)
     dataset = wt.download(folder.as_uri(), tmp_path / "part", runs=["b"])
     assert [run.id for run in dataset] == ["b"]
     assert not (tmp_path / "part/runs/a.zarr").exists()
     assert wt.verify(dataset.path, deep=True) == []
+
+
+@pytest.mark.parametrize("runs", [None, ["a"]])
+def test_what_a_stopped_download_left_of_something_else_goes(
+    tmp_path: Path, runs: list[str] | None
+) -> None:
+    draft = folders(tmp_path / ".here.download", 9)
+    (draft / "runs/.b.part").write_bytes(b"stopped")
+    address = folders(tmp_path / "folders", 3).as_uri()  # published again since, and shorter
+    dataset = wt.download(address, tmp_path / "here", runs=runs)
+    straight = wt.download(address, tmp_path / "straight", runs=runs)
+    assert wt.verify(dataset.path) == []
+    assert files_of(Path(dataset.path)) == files_of(Path(straight.path))
+    assert not list((tmp_path / "here").rglob("*.part"))
 
 
 def test_what_was_cut_for_another_request_is_not_kept(large: Path, tmp_path: Path) -> None:

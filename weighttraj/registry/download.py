@@ -124,7 +124,6 @@ def download(
             _fetch_all(store, at, wanted, draft, console or Console(quiet=True))
         else:
             _cut_all(dataset, draft, steps, arrays, console or Console(quiet=True))
-        (draft / REQUEST).unlink(missing_ok=True)
         if part:
             _list_part(dataset, draft, steps, arrays)
         else:
@@ -195,6 +194,7 @@ def _fetch_all(
             _fetch(store, (at / line.path).part, line, draft / line.path, progress, task)
 
         for_each(lines, fetch)
+    _sweep(draft, {line.path for line in lines})
 
 
 def _fetch(
@@ -306,11 +306,23 @@ def _cut_all(
     console: Console,
 ) -> None:
     """Read a part of each run from where it is, and pack it here."""
+    names = {run.id: f"runs/{run.id}.zarr{PACKED}" for run in dataset}
     with LoggedProgress(console=console, disable=console.quiet) as progress:
         for run in progress.track(dataset.runs, description="runs"):
-            target = draft / "runs" / f"{run.id}.zarr{PACKED}"
+            target = draft / names[run.id]
             if not target.is_file():  # a packed run appears when it is whole
                 cut(run.path, target, steps=steps, arrays=arrays)
+    _sweep(draft, set(names.values()))
+
+
+def _sweep(draft: Path, names: Collection[str]) -> None:
+    """Remove all but these files: what a download of something else left, that was stopped."""
+    for path in sorted(draft.rglob("*"), reverse=True):  # what is in a folder before the folder
+        if path.is_dir():
+            with contextlib.suppress(OSError):  # it is not empty
+                path.rmdir()
+        elif path.relative_to(draft).as_posix() not in names:
+            path.unlink()
 
 
 def _list_part(
@@ -326,10 +338,6 @@ def _list_part(
         else entry
         for entry in _entries(dataset)
     )
-    wanted = {entry.path for entry in entries}
-    for file in (draft / "runs").iterdir():  # of a download that was stopped, of other runs
-        if f"runs/{file.name}" not in wanted:
-            shutil.rmtree(file) if file.is_dir() else file.unlink()
     recipe: dict[str, Any] = {
         "part": {
             "id": dataset.info.id,
