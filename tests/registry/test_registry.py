@@ -278,6 +278,21 @@ def test_what_must_stay_is_not_deleted(store: Path) -> None:
     assert (store / "small").is_dir()
 
 
+def test_nothing_is_deleted_through_a_link(
+    store: Path, small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(small_dataset, tmp_path / "clone/own")
+    monkeypatch.setattr("weighttraj.registry.local.clone", lambda: tmp_path / "clone")
+    (store / "ours").symlink_to(tmp_path / "clone")
+    with pytest.raises(RegistryError, match="of a clone"):
+        delete("ours/own")
+    assert (tmp_path / "clone/own/dataset.json").is_file()
+    (store / "link").symlink_to(store / "small")
+    with pytest.raises(RegistryError, match="is a link"):
+        delete("link")
+    assert (store / "link/dataset.json").is_file()
+
+
 def test_the_commands(store: Path, tmp_path: Path) -> None:
     listed = shell("weighttraj", "list").stdout
     assert all(name in listed for name in ("small", "below", "team/theirs"))

@@ -83,16 +83,25 @@ def delete(name: str) -> Path:
 
     Raises:
         FileNotFoundError: there is no such data set.
-        RegistryError: the name is a path, or the data set belongs to the clone.
+        RegistryError: the name is a path, the data set belongs to the clone or is a link.
     """
     path = find(name).path
-    if (own := clone()) is not None and path.is_relative_to(own):
+    real = path.resolve()
+    if (own := clone()) is not None and real.is_relative_to(own.resolve()):
         raise RegistryError(
             "the data sets of a clone are not deleted",
             where=path,
             do="they belong to the repository; delete the clone, if you must",
         )
-    if any(folder.resolve().is_relative_to(path.resolve()) for folder in folders()):
+    if path.is_symlink():
+        raise RegistryError(
+            "the data set is a link, and what a link leads to is not deleted",
+            expected="a folder",
+            got=f"a link to {real}",
+            where=path,
+            do="remove the link, or the folder, yourself",
+        )
+    if any(folder.resolve().is_relative_to(real) for folder in folders()):
         raise RegistryError(
             "other data sets have their ids in this folder, so it is not deleted as one",
             where=path,
