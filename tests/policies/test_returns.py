@@ -202,6 +202,9 @@ def test_returns_of_a_folder_are_refused_before_anything_is_played(
         fill_returns(dataset, more)
     assert not played
     wt.pack(folder)  # as it says
+    screen = io.StringIO()
+    fill_returns(dataset, more, console=Console(file=screen, width=200))
+    assert f"their folders are still there, so left for later: {made.id}" in screen.getvalue()
     shutil.rmtree(folder)
     fill_returns(dataset, more)
     assert np.isfinite(wt.open(dataset).runs[0]["eval/returns"][10]).all()

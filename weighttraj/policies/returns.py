@@ -309,13 +309,18 @@ def _crc(text: str) -> str:
 
 
 def _finished(dataset: Dataset, console: Console) -> list[Run]:
-    """Runs that will not change; a folder that is packed, but not yet listed so, is about to go."""
-    places = {run.id: Path(run.path) for run in dataset}
-    packed = {i for i, p in places.items() if p.with_name(f"{p.name}{PACKED}").is_file()}
-    ended = [run for run in dataset if run.info.status != "collecting"]
-    done = [run for run in ended if run.id not in packed]
-    if skipped := [run.id for run in dataset if run not in done]:
-        console.print(f"still being collected, so left for later: {', '.join(skipped)}")
+    """Runs that will not change; a folder that is packed is to go, with what it would be given."""
+    left: dict[str, list[str]] = {}
+    done = []
+    for run in dataset:
+        if run.info.status == "collecting":
+            left.setdefault("still being collected", []).append(run.id)
+        elif Path(f"{run.path}{PACKED}").is_file():
+            left.setdefault("packed, but their folders are still there", []).append(run.id)
+        else:
+            done.append(run)
+    for why, ids in left.items():
+        console.print(f"{why}, so left for later: {', '.join(ids)}")
     return done
 
 
