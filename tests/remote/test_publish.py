@@ -461,5 +461,5 @@ def test_the_command(published: Path, tmp_path: Path) -> None:
 def test_the_command_says_what_is_wrong(tmp_path: Path) -> None:
     done = shell("weighttraj", "download", f"file://{tmp_path}")
     assert done.returncode == 1
-    assert "no data set at" in done.stdout
+    assert "no data set at" in done.stderr
     assert "Traceback" not in done.stderr

@@ -128,7 +128,7 @@ def test_a_killed_rank_ends_the_others_and_the_same_command_goes_on(
     done = torchrun(small_dataset, out, str(tmp_path / "dying.py"))
     assert done.returncode != 0
     # Whichever comes first: the broken connection, or SIGTERM from `torchrun`.
-    said = " ".join(done.stdout.split())
+    said = " ".join((done.stdout + done.stderr).split())
     assert "give the same command again to go on" in said, done
     assert batches(out) == [10, 20]
     assert int(load_file(out / "state.safetensors")["n"]) == SAVED
