@@ -29,9 +29,9 @@ PHASES = ("learning", "plateau")
 NEAR = 10
 """The paper's horizons end here."""
 
-Errors = Float[np.ndarray, "start horizon tensor"]
-Chosen = Bool[np.ndarray, " start"]
-Shares = Float[np.ndarray, " start"]
+Errors = Float[np.ndarray, "_start horizon tensor"]
+Chosen = Bool[np.ndarray, " _start"]
+Shares = Float[np.ndarray, " _start"]
 
 
 class Summary:
