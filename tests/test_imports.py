@@ -19,6 +19,7 @@ ALLOWED = {
     "weighttraj.errors": [],
     "weighttraj.threads": [],
     "weighttraj.progress": [],
+    "weighttraj.terminal": [],
     "weighttraj.engine": ["weighttraj.errors", "weighttraj.engine"],
     "weighttraj.engine.choose": [
         "weighttraj.errors",
@@ -258,6 +259,7 @@ ALLOWED = {
         "weighttraj.format.locate",
         "weighttraj.registry",
         "weighttraj.remote",
+        "weighttraj.terminal",
         "later weighttraj.collect.recipe",
         "later weighttraj.load",
         "later weighttraj.publish.gallery",
@@ -428,7 +430,7 @@ ALLOWED = {
         "tipl.zoo",
         "door weighttraj",
     ],
-    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors"],
+    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", "weighttraj.terminal"],
     "tipl": ["tipl", "weighttraj.errors"],
 }
 

@@ -17,6 +17,7 @@ from rich.table import Table
 
 import weighttraj as wt
 from weighttraj.errors import WeightTrajError
+from weighttraj.terminal import Output, while_read
 
 try:
     import tipl
@@ -40,7 +41,7 @@ except WeightTrajError as error:
     sys.exit(f"error: {error}")
 
 app = tyro.extras.SubcommandApp()
-console = Console()
+console = Output()
 errors = Console(stderr=True)
 _WIDE = 150
 """Characters that a table with intervals needs."""
@@ -290,13 +291,14 @@ def main() -> None:
     try:
         _run()
     except KeyboardInterrupt:  # while an error is printed, too
-        console.print("stopped; give the same command again to go on")
+        errors.print("stopped; give the same command again to go on")
         sys.exit(130)
 
 
 def _run() -> None:
     try:
-        app.cli(prog="tipl", description="Forecasts of policy weights: train and judge models.")
+        with while_read():
+            app.cli(prog="tipl", description="Forecasts of policy weights: train and judge models.")
     except (WeightTrajError, OSError) as error:
         errors.print(f"[red]error:[/red] {escape(str(error))}")
         sys.exit(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +19,10 @@ from weighttraj import registry
 from weighttraj.errors import RegistryError, WeightTrajError
 from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.remote import is_remote
+from weighttraj.terminal import Output, while_read
 
 app = tyro.extras.SubcommandApp()
-console = Console()
+console = Output()
 errors = Console(stderr=True)
 
 
@@ -400,7 +400,7 @@ def _report(args: _Report) -> None:
         _gallery(args)
         return
     if args.path is None:
-        console.print("[red]error:[/red] name a data set, or give --all for all that are here")
+        errors.print("[red]error:[/red] name a data set, or give --all for all that are here")
         raise SystemExit(2)
     from weighttraj.publish.report import report
 
@@ -498,14 +498,13 @@ def _finish(path: Path, problems: list[str], otherwise: str) -> None:
 def main() -> None:
     """Run the command line; errors of ours are printed without a traceback."""
     try:
-        app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
-    except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        with while_read():
+            app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
     except (WeightTrajError, OSError) as error:
         errors.print(f"[red]error:[/red] {escape(str(error))}")
         sys.exit(1)
     except KeyboardInterrupt:
-        console.print("stopped; give the same command again to go on")
+        errors.print("stopped; give the same command again to go on")
         sys.exit(130)
 
 
