@@ -82,6 +82,18 @@ def test_repair_mends_and_cuts(tmp_path: Path) -> None:
     assert len(wt.open_run(tmp_path / "r.zarr")) == 2
 
 
+@pytest.mark.parametrize("to", ["safetensors", "sb3"])
+def test_a_snapshot_that_is_not_there_is_one_message(
+    to: str, small_dataset: Path, tmp_path: Path
+) -> None:
+    run_path, out = small_dataset / "runs/seed0000.zarr.zip", tmp_path / "out"
+    done = run("weighttraj", "export", run_path, "--to", to, "--t", 99_999, "--out", out)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: there are no such rows")
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_pack_and_cache(small_dataset: Path, tmp_path: Path) -> None:
     source = small_dataset / "runs/seed0000.zarr.zip"
     out = tmp_path / "small.zarr.zip"

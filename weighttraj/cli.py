@@ -173,7 +173,7 @@ def _search(
     ] = ("dataset", "run_id", "split", "seed", "final_return"),
 ) -> None:
     """Find runs of all data sets that are here, by their environment, return, hyper-parameters."""
-    found = registry.search(query)
+    found = registry.search(query, damaged=_left_out)
     table = Table(title=f"{len(found)} runs")
     shown = list(columns)
     if len(found) and (unknown := [column for column in columns if column not in found.columns]):
@@ -188,6 +188,10 @@ def _search(
     for row in found[shown].itertuples(index=False) if len(found) else ():
         table.add_row(*(escape(_text(value)) for value in row))
     console.print(table)
+
+
+def _left_out(error: WeightTrajError) -> None:
+    errors.print(f"[yellow]left out:[/yellow] {escape(str(error))}")
 
 
 def _text(value: object) -> str:

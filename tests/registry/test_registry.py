@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 import weighttraj as wt
@@ -15,7 +16,14 @@ from tests.small import SMALL_RECIPE
 from tests.test_cli import run as shell
 from weighttraj.collect import collect, replay
 from weighttraj.collect.recipe import Seeds
-from weighttraj.errors import CollectError, FormatError, RegistryError, StoreExistsError
+from weighttraj.errors import (
+    CollectError,
+    DamageError,
+    FormatError,
+    RegistryError,
+    StoreExistsError,
+    WeightTrajError,
+)
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.format.locate import VARIABLE, clone, locate
 from weighttraj.registry import combine, create, delete, local_datasets, search, split
@@ -119,6 +127,33 @@ def test_data_sets_without_a_table_are_searched_too(store: Path) -> None:
 def test_queries_that_mean_nothing_are_refused(query: str, store: Path) -> None:
     with pytest.raises(RegistryError, match=r"cannot be understood(.|\n)*final_return"):
         search(query)
+
+
+@pytest.mark.parametrize("name", ["tables/runs.parquet", "dataset.json"])
+def test_a_damaged_data_set_is_named_and_the_others_are_searched(name: str, store: Path) -> None:
+    if name == "dataset.json":  # which is read where there is no table
+        shutil.rmtree(store / "small/tables")
+    (store / "small" / name).write_bytes(b"damaged")
+    with pytest.raises(FormatError, match=name):
+        search("seed == 2")
+    errors: list[WeightTrajError] = []
+    found = search("seed == 2", damaged=errors.append)
+    assert {"below", "team/theirs"} <= set(found["dataset"])
+    assert "small" not in set(found["dataset"])
+    (error,) = errors
+    assert name in str(error)
+    done = shell("weighttraj", "search", "seed == 2", "--columns", "dataset")
+    assert done.returncode == 0
+    assert "team/theirs" in done.stdout
+    assert name in done.stderr.replace("\n", "")
+
+
+def test_a_table_that_pandas_fails_on_is_damaged(store: Path) -> None:
+    file = store / "small/tables/runs.parquet"
+    table = pq.read_table(file)
+    pq.write_table(table.replace_schema_metadata({"pandas": "{}"}), file)  # pandas: KeyError
+    with pytest.raises(DamageError, match=r"runs\.parquet"):
+        search()
 
 
 # New ones of old ones

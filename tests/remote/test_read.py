@@ -18,6 +18,7 @@ from tests.remote import servers
 from tests.remote.conftest import Bucket
 from weighttraj.errors import DamageError, FormatError, RegistryError, RemoteError
 from weighttraj.remote import RemotePath, is_remote
+from weighttraj.remote.store import TIMEOUT
 
 ROOT = Path(__file__).parents[2]
 RELEASED = ROOT / "datasets/inverted-pendulum-v4-ppo-v1/data"
@@ -188,6 +189,15 @@ def test_a_busy_server_is_asked_again(server: servers.FileServer, status: int) -
 def test_a_server_that_stays_busy_is_named(server: servers.FileServer) -> None:
     server.fault("dataset.json", 503, times=1000)
     with pytest.raises(RemoteError, match=r"(?s)cannot be reached.*503.*dataset\.json"):
+        wt.open(f"{server.url}/small-v1")
+
+
+@pytest.mark.parametrize("told", ["abc", "", "nan", "inf", "-5", "1e300"])
+def test_a_time_that_is_none_is_refused(
+    told: str, server: servers.FileServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(TIMEOUT, told)
+    with pytest.raises(RemoteError, match=f"(?s)no time to wait.*{TIMEOUT}"):
         wt.open(f"{server.url}/small-v1")
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from weighttraj.errors import DamageError, RegistryError, missing_extra
+from weighttraj.errors import DamageError, RegistryError, WeightTrajError, missing_extra
 from weighttraj.format import open_dataset
 from weighttraj.format.tables import RUNS, run_row
 from weighttraj.registry.local import LocalDataset, local_datasets
@@ -14,7 +15,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> pd.DataFrame:
+def search(
+    query: str = "",
+    datasets: Iterable[LocalDataset] | None = None,
+    *,
+    damaged: Callable[[WeightTrajError], object] | None = None,
+) -> pd.DataFrame:
     """Runs that fit a condition, over all data sets that are here.
 
     >>> search("env == 'HalfCheetah-v4' and final_return > 3000")  # doctest: +SKIP
@@ -23,12 +29,14 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
         query: a condition on the columns, in the language of ``pandas.DataFrame.query``; names
             with a point stand between backticks: ``hyperparameters.gamma``. Empty: all runs.
         datasets: where to look; None: in all of ``local_datasets()``.
+        damaged: is told what is wrong with a data set that cannot be read, which is left out; None:
+            that is raised.
 
     Returns:
         A row for each run: ``dataset``, and the columns of its table of runs.
 
     Raises:
-        DamageError: the table of a data set is damaged.
+        FormatError: a data set, or its table of runs, is damaged.
         RegistryError: the query cannot be understood, or names what no run has.
         MissingExtraError: pandas or pyarrow is not installed.
     """
@@ -39,20 +47,13 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
         raise missing_extra(str(error.name), "sb3") from error
     tables = []
     for dataset in local_datasets() if datasets is None else datasets:
-        file = dataset.path / RUNS
-        # A data set that is still being collected has no table yet.
-        if file.is_file():
-            try:
-                table = pd.read_parquet(file)
-            except (OSError, ValueError) as error:  # pyarrow's are such
-                raise DamageError(
-                    "the table of a data set's runs cannot be read",
-                    got=error,
-                    where=file,
-                    do="restore it from a copy, or give the data set another place",
-                ) from error
-        else:
-            table = pd.DataFrame([run_row(run) for run in open_dataset(dataset.path)])
+        try:
+            table = _table(dataset.path)
+        except WeightTrajError as error:
+            if damaged is None:
+                raise
+            damaged(error)
+            continue
         table.insert(0, "dataset", dataset.id)
         if len(table):
             tables.append(table.dropna(axis="columns", how="all"))
@@ -74,6 +75,24 @@ def search(query: str = "", datasets: Iterable[LocalDataset] | None = None) -> p
             "\"env == 'HalfCheetah-v4' and `hyperparameters.gamma` < 1\"",
         ) from error
     return rows.loc[fits].reset_index(drop=True)
+
+
+def _table(path: Path) -> pd.DataFrame:
+    """The runs of a data set."""
+    import pandas as pd
+
+    file = path / RUNS
+    if not file.is_file():  # a data set that is still being collected has no table yet
+        return pd.DataFrame([run_row(run) for run in open_dataset(path)])
+    try:
+        return pd.read_parquet(file)
+    except Exception as error:  # pyarrow's and pandas', which are of every kind
+        raise DamageError(
+            "the table of a data set's runs cannot be read",
+            got=error,
+            where=file,
+            do="restore it from a copy, or give the data set another place",
+        ) from error
 
 
 __all__ = ["search"]

@@ -252,19 +252,19 @@ def store_at(root: str) -> RemoteStore:
     return RemoteStore(root)
 
 
-def _patience() -> float:
-    """Seconds for which a server that does not answer is asked again."""
+def _patience() -> timedelta:
+    """For how long a server that does not answer is asked again."""
     told = os.environ.get(TIMEOUT, "60")
-    try:
-        return float(told)
-    except ValueError as error:
-        raise RemoteError(
-            "the time to wait for a server is no number",
-            expected="seconds",
-            got=told,
-            where=f"environment variable {TIMEOUT}",
-            do="set it to a number, or unset it",
-        ) from error
+    with contextlib.suppress(ValueError, OverflowError):  # no number; not finite, or too many
+        if (patience := timedelta(seconds=float(told))) >= timedelta():
+            return patience
+    raise RemoteError(
+        "this is no time to wait for a server",
+        expected="seconds, 0 or more",
+        got=told,
+        where=f"environment variable {TIMEOUT}",
+        do="set it to a number, or unset it",
+    )
 
 
 def _client(root: str) -> ObjectStore:
@@ -280,7 +280,7 @@ def _client(root: str) -> ObjectStore:
     }
     retries: Any = {
         "max_retries": 100,
-        "retry_timeout": timedelta(seconds=_patience()),
+        "retry_timeout": _patience(),
         "backoff": {
             "init_backoff": timedelta(milliseconds=100),
             "max_backoff": timedelta(seconds=5),
