@@ -47,7 +47,14 @@ def test_only_what_is_asked_for_is_read(small_dataset: Path, tmp_path: Path) -> 
     path = tmp_path / "small"
     shutil.copytree(small_dataset, path)
     (path / "runs/seed0003.zarr.zip").write_bytes(b"damaged")
-    assert [run.id for run in wt.open(path).select(id="seed0001")] == ["seed0001"]
+    for wanted in (
+        {"id": "seed0001"},
+        {"seed": 1},
+        {"seed": range(3), "final_return": np.isfinite},
+    ):
+        assert "seed0001" in ids(wt.open(path).select(**wanted))
+    with pytest.raises(DamageError):
+        wt.open(path).select(status="complete")
 
 
 def test_rows_are_read_as_numpy_would(small_dataset: Path) -> None:

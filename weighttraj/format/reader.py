@@ -557,7 +557,7 @@ def open_run(path: str | Place) -> Run:
 _FACTS: dict[str, Callable[[Run], Any]] = {
     "id": lambda run: run.id,
     "split": lambda run: run.split,
-    "seed": lambda run: run.info.seed,
+    "seed": lambda run: _seed(run),
     "status": lambda run: run.info.status,
     "env": lambda run: run.info.env.id if run.info.env else None,
     "algorithm": lambda run: run.info.algorithm.name if run.info.algorithm else None,
@@ -565,6 +565,11 @@ _FACTS: dict[str, Callable[[Run], Any]] = {
     "final_mean_return": lambda run: run.final_mean_return,
 }
 """What ``select`` can ask of a run, beside its hyper-parameters."""
+
+
+def _seed(run: Run) -> int | None:
+    listed = run._entry.seed if run._entry else None
+    return run.info.seed if listed is None else listed
 
 
 def _hyperparameters(run: Run) -> dict[str, Any]:
