@@ -68,6 +68,17 @@ def test_rows_are_read_as_numpy_would(small_dataset: Path) -> None:
         assert isinstance(caught.value, WeightTrajError)
 
 
+def test_dots_stand_for_what_is_not_named(small_dataset: Path) -> None:
+    run = wt.open(small_dataset).runs[0]
+    for name in ("probe/observations", "policy/weights", "index/num_timesteps"):
+        array = run[name]
+        whole = array[:]
+        for key in ((), (...,), (..., 1), (1, ..., 1), (..., slice(1, 3)), (..., [0, 1])):
+            if sum(k is not ... for k in key) <= whole.ndim:
+                np.testing.assert_array_equal(array[key], whole[key])
+        np.testing.assert_array_equal(array[..., *(1,) * whole.ndim], whole[(1,) * whole.ndim])
+
+
 def test_runs_are_found_by_id(small_dataset: Path) -> None:
     ds = wt.open(small_dataset)
     assert ds["seed0002"].info.seed == 2

@@ -101,7 +101,12 @@ class StoredArray:
             IndexError: outside the committed rows.
             DamageError: a chunk is missing or damaged, or a digest does not match.
         """
-        rows, *rest = key if isinstance(key, tuple) else (key,)
+        rows, *rest = (key or (...,)) if isinstance(key, tuple) else (key,)
+        if rows is Ellipsis:  # what follows are the last dimensions
+            if len(rest) >= len(self.shape):
+                rows, *rest = rest
+            else:
+                rows, rest = slice(None), rest and [..., *rest]
         index = _rows(rows, len(self), f"{self._store.path}, array {self._spec.name!r}")
         values = self._store.read(self._spec.name, (index, *rest) if rest else index)
         if self._spec.name == "policy/weights" and not rest:
@@ -596,8 +601,6 @@ def _fits(value: Any, wanted: Any) -> bool:
 
 def _rows(key: Any, n: int, where: str) -> Any:
     """A row selection with non-negative bounds inside the committed rows."""
-    if key is Ellipsis:
-        key = slice(None)
     if isinstance(key, slice):
         start, stop, step = key.indices(n)
         if step < 1:
