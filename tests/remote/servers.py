@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import email.utils
 import http.server
 import json
 import os
@@ -118,6 +119,7 @@ def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> N
     match = re.fullmatch(r"bytes=(\d*)-(\d*)", span or "")
     if match is not None:
         if not match[1] and not server.suffixes:
+            server.log.append(Request(handler.command, path, span, 0))
             _head(handler, 400, {"Content-Length": "0"})
             return
         start = int(match[1]) if match[1] else max(0, size - int(match[2]))
@@ -127,6 +129,7 @@ def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> N
     part = fault(part) if callable(fault) else part
     tag = f'"{file.stat().st_mtime_ns}"'
     headers = {"Content-Length": str(len(part)), "ETag": tag, "Accept-Ranges": "bytes"}
+    headers["Last-Modified"] = email.utils.formatdate(file.stat().st_mtime, usegmt=True)
     if status == 206:
         headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
     _head(handler, status, headers)

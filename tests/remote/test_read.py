@@ -285,6 +285,30 @@ def test_a_server_that_sends_no_parts_says_what_to_do(published: Path, tmp_path:
 def test_a_server_that_knows_no_suffixes(published: Path) -> None:
     with servers.FileServer(published.parent, suffixes=False) as server:
         same(wt.open(f"{server.url}/small-v1"), wt.open(published))
+        refused = [request for request in server.log if (request.range or "").startswith("bytes=-")]
+        assert len(refused) == 4  # once for each run: it will not change its mind
+
+
+def test_azure_which_is_asked_for_no_suffixes(
+    published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(published, tmp_path / "container/small-v1")
+    with servers.FileServer(tmp_path) as server:
+        monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "me")
+        monkeypatch.setenv("AZURE_STORAGE_ENDPOINT", server.url)
+        monkeypatch.setenv("AZURE_SKIP_SIGNATURE", "true")
+        same(wt.open("az://container/small-v1"), wt.open(published))
+
+
+@pytest.mark.parametrize(("status", "what"), [(403, "does not let us"), (503, "cannot be reached")])
+def test_a_run_that_cannot_be_had_is_not_asked_for_in_another_way(
+    status: int, what: str, server: servers.FileServer
+) -> None:
+    run = wt.open(f"{server.url}/small-v1").runs[0]
+    server.fault(r"\.zip", status, times=1000)
+    with pytest.raises(RemoteError, match=what):
+        run.weights[:]
+    assert {request.method for request in server.log} == {"GET"}
 
 
 def test_no_credentials(server: servers.FileServer) -> None:

@@ -28,6 +28,8 @@ TIMEOUT = "WEIGHTTRAJ_REMOTE_TIMEOUT"
 BROKEN = 4
 """Times that an answer is asked for again which broke off in the middle."""
 
+_REFUSED = re.compile(r"(?s)status code: (400|416|501)(?!.*RequestTimeout)")
+"""Answers that stay the same, however often is asked; S3 also says 400 where it waited too long."""
 _CAUSE = re.compile(r'message: "([^"]+)"|kind: (\w+),?\s*}')
 _process: list[int] = []
 T = TypeVar("T")
@@ -52,6 +54,10 @@ class BrokenOffError(RemoteError):
 
 class NoPartsError(RemoteError):
     """The server sends whole objects only."""
+
+
+class RefusedError(RemoteError):
+    """The server answers, but not what it was asked."""
 
 
 class RemoteStore:
@@ -81,10 +87,8 @@ class RemoteStore:
         """The last bytes of an object, all of a smaller one; None: there is no such object."""
         try:
             return self._get(name, {"suffix": count})
-        except NoPartsError:
-            raise
-        except RemoteError:
-            # Some servers send ranges, but not from the end.
+        except (NoPartsError, RefusedError):
+            # Some servers send ranges, but not from the end; of Azure it is not even asked.
             size = self.size(name)
             if size is None:
                 raise
@@ -198,7 +202,8 @@ class RemoteStore:
             except exceptions.GenericError as error:
                 if not again:
                     raise BrokenOffError(str(self._error(name, error))) from None
-                if attempt == BROKEN or " retries, " in str(error):
+                final = " retries, " in str(error) or _REFUSED.search(str(error))
+                if final or attempt == BROKEN:
                     raise self._error(name, error) from None
                 time.sleep(0.1 * 2**attempt)
             except exceptions.AlreadyExistsError as error:
@@ -218,7 +223,7 @@ class RemoteStore:
         got = " ".join(text.split())[:400] + (f" ({causes[-1]})" if causes else "")
         do = f"see whether the server can be reached, and try again; {TIMEOUT} says how long"
         what = "a remote object cannot be reached"
-        kind = RemoteError
+        kind = RefusedError if _REFUSED.search(text) else RemoteError
         if isinstance(error, exceptions.NotSupportedError):
             what, kind = "the server cannot send parts of an object", NoPartsError
             do = f"weighttraj download {self.root}, and open what lies here then"
