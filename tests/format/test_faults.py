@@ -243,9 +243,10 @@ def test_a_clock_that_jumps_changes_nothing(reference: Path, tmp_path: Path, the
 
 
 def test_no_module_asks_for_the_time_or_age_of_anything() -> None:
-    # The one date is that of provenance, for the record; the pauses are those between requests.
+    # The one date is that of provenance, for the record; the pauses are those between requests. Of
+    # two objects that one server holds, an upload asks which is older, by that server's clock.
     asks = re.compile(r"time\.(time|monotonic|sleep)\(|st_[mca]time|getmtime|datetime")
     files = sorted((ROOT / "weighttraj").rglob("*.py"))
     assert len(files) > 20
     found = {p.name for p in files if asks.search(p.read_text())}
-    assert found <= {"describe.py", "store.py"}
+    assert found <= {"describe.py", "store.py", "upload.py"}

@@ -167,4 +167,4 @@ def test_the_command(
     assert (out / "cards/a-model.html").is_file()
     with pytest.raises(SystemExit):
         cli._report(cli._Report())
-    assert "--all" in capsys.readouterr().out
+    assert "--all" in capsys.readouterr().err
