@@ -33,7 +33,8 @@ class _Collect:
     out: Path | None = None
     """Folder of the data set. Default: data/<id of the recipe>."""
     seeds: str | None = None
-    """Only these seeds: 3, or a range 0:50 (the end excluded). Default: the recipe's."""
+    """Only these seeds: 3, a range 0:50 (the end excluded), or several: 0:4,30:32. Default: the
+    recipe's."""
     workers: int = 1
     """Processes, each with one thread, that train a run, or a population, at a time."""
     scheduler: str | None = None

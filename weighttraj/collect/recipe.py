@@ -20,7 +20,7 @@ SPLITS = ("train", "validation", "test")
 
 @dataclass(frozen=True, kw_only=True)
 class Seeds:
-    """Seeds of each split. A range is written ``"0:30"``, the end excluded."""
+    """Seeds of each split: a list, or ranges such as ``"0:30"`` (the end excluded)."""
 
     train: list[int] | str = field(default_factory=list)
     """Runs that models are trained on."""
@@ -179,27 +179,34 @@ def read_recipe(path: str | Path) -> Recipe:
 
 
 def parse_seeds(seeds: list[int] | str) -> list[int]:
-    """Seeds from a list or a range.
+    """Return seeds from a list, a range, or several ranges with commas between them.
 
     >>> parse_seeds("3:6")
     [3, 4, 5]
+    >>> parse_seeds("0:2,30,40:42")
+    [0, 1, 30, 40, 41]
 
     Raises:
-        RecipeError: it is no such range, or a seed is negative.
+        RecipeError: if it is no such range, or a seed is negative.
     """
     try:
         if isinstance(seeds, str):
-            start, _, stop = seeds.partition(":")
-            seeds = list(range(int(start), int(stop or int(start) + 1)))
+            seeds = [seed for part in seeds.split(",") for seed in _parse_range(part)]
         if min(seeds, default=0) < 0:
             raise ValueError
     except ValueError as error:
         raise RecipeError(
-            "these are no seeds",
-            expected='a list of integers from 0, or a range such as "0:30" (the end excluded)',
+            "invalid seeds",
+            expected='a list of integers from 0, or ranges such as "0:30" or "0:4,30,40:44" '
+            "(the end of a range is excluded)",
             got=repr(seeds),
         ) from error
     return seeds
+
+
+def _parse_range(text: str) -> range:
+    start, _, stop = text.partition(":")
+    return range(int(start), int(stop or int(start) + 1))
 
 
 def _check_keys(table: dict[str, Any], kind: type, where: str) -> None:
