@@ -197,8 +197,8 @@ def parse_seeds(seeds: list[int] | str) -> list[int]:
     except ValueError as error:
         raise RecipeError(
             "invalid seeds",
-            expected='a list of integers from 0, or ranges such as "0:30" or "0:4,30,40:44" '
-            "(the end of a range is excluded)",
+            expected='a list of integers from 0, a range such as "0:30" (the end excluded), or '
+            'several with commas between them, such as "0:4,30"',
             got=repr(seeds),
         ) from error
     return seeds
