@@ -147,7 +147,9 @@ ALLOWED = {
         "weighttraj.policies.kernels",
         "weighttraj.policies.simulators",
     ],
+    "weighttraj.learning": [],
     "weighttraj.policies": [
+        "weighttraj.learning",
         "weighttraj.progress",
         "weighttraj.threads",
         "weighttraj.engine",

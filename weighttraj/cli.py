@@ -71,7 +71,10 @@ class _Returns:
     every: int = 10
     """Evaluate every so many-th snapshot, and the last one."""
     first: int = 0
-    """And all of the first so many: policies change most at the start."""
+    """Also each of the first N snapshots: policies change most at the start."""
+    learning: int = 0
+    """Also every N-th snapshot of the learning phase, until the return has come 95 % of the way
+    from its first to its final value; 0: none."""
     mode: Literal["both", "deterministic", "sampled"] = "both"
     """How the policies act: the distribution's mode, samples, or both in turn."""
     seed: int = 0
@@ -92,6 +95,7 @@ def _returns(args: _Returns) -> None:
         episodes=args.episodes,
         every=args.every,
         first=args.first,
+        learning=args.learning,
         modes=("deterministic", "sampled") if args.mode == "both" else (args.mode,),
         seed=args.seed,
     )

@@ -23,6 +23,7 @@ from weighttraj.engine import Tell
 from weighttraj.errors import EngineError, FormatError, PolicyError, StoreLockedError
 from weighttraj.format import RunEntry
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.learning import learning_phase
 from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
 from weighttraj.policies.returns import play_rows
 
@@ -322,3 +323,20 @@ def test_every_kth_the_first_and_the_last() -> None:
     assert ReturnsConfig(every=10, first=4).rows(33) == [0, 1, 2, 3, 10, 20, 30, 32]
     assert ReturnsConfig(every=10, first=100).rows(3) == [0, 1, 2]
     assert ReturnsConfig(every=3).rows(0) == []
+
+
+def test_the_learning_phase_of_each_run_is_evaluated_densely(dataset: Path) -> None:
+    filled = fill_returns(dataset, replace(CONFIG, first=0, learning=2))
+    for run in filled:
+        rows = np.flatnonzero(np.isfinite(run.mean_return(deterministic=False)))
+        coarse = sorted({*range(0, len(run), 20), len(run) - 1})
+        sparse = np.full(len(run), np.nan)
+        sparse[coarse] = run.mean_return(deterministic=False)[coarse]
+        end = learning_phase(sparse)
+        assert rows.tolist() == sorted({*coarse, *range(0, end + 1, 2)})
+        assert run.evaluation is not None
+        assert run.evaluation.learning == 2
+    assert any(len(np.flatnonzero(np.isfinite(r.mean_return()))) > 3 for r in filled)
+    before = stored(dataset)
+    fill_returns(dataset, replace(CONFIG, first=0, learning=2))
+    assert stored(dataset) == before

@@ -147,7 +147,9 @@ class Evaluation:
     every: int = 1
     """Returns were asked for of the snapshots 0, every, 2 * every and so on, and of the last."""
     first: int = 0
-    """And of all of the first so many."""
+    """Returns were also asked for of each of the first N snapshots."""
+    learning: int = 0
+    """Returns were also asked for of every N-th snapshot of the learning phase; 0: of no more."""
     normalizer: Literal["own", "final"] = "own"
     """Whose statistics normalised observations: the snapshot's own, or those of the last one."""
     simulator: str = ""
@@ -164,12 +166,13 @@ class Evaluation:
                 got=f"{n} seeds, {len(self.deterministic)} modes",
                 do="give both, one for each column of the returns",
             )
-        counts = (self.every - 1, self.first)
+        counts = (self.every - 1, self.first, self.learning)
         if min(*self.seeds, *counts) < 0 or max(counts) > _MAX_COUNT:
             raise FormatError(
                 "a number of an evaluation is out of range",
-                expected="seeds at least 0, every 1 to 2**48, first 0 to 2**48",
-                got=f"smallest seed {min(self.seeds)}, every {self.every}, first {self.first}",
+                expected="seeds at least 0, every 1 to 2**48, first and learning 0 to 2**48",
+                got=f"smallest seed {min(self.seeds)}, every {self.every}, first {self.first}, "
+                f"learning {self.learning}",
                 do="give the numbers that the episodes were played with",
             )
 

@@ -35,6 +35,7 @@ from weighttraj.format.catalog import MANIFEST, read_dataset_info
 from weighttraj.format.integrity import seal, unseal
 from weighttraj.format.objects import replace_file
 from weighttraj.format.storage import PACKED
+from weighttraj.learning import learning_phase
 from weighttraj.policies.batch import load_policies
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 from weighttraj.policies.simulators import GymnasiumSimulator
@@ -56,24 +57,28 @@ class ReturnsConfig:
     every: int = 10
     """Every how many snapshots; the last one is always evaluated."""
     first: int = 0
-    """And all of the first so many: policies change most at the start."""
+    """Also each of the first N snapshots: policies change most at the start."""
+    learning: int = 0
+    """Also every N-th snapshot of each run's learning phase, which ends where the return has come
+    95 % of the way from its first to its final value; 0: none."""
     modes: tuple[Mode, ...] = ("deterministic", "sampled")
     """Actions: the distribution's mode, samples, or both."""
     seed: int = 0
     """Seed of the first episode."""
 
     def __post_init__(self) -> None:
-        wrong = min(self.episodes, self.every, self.first + 1, self.seed + 1) < 1
+        least = (self.episodes, self.every, self.first + 1, self.learning + 1, self.seed + 1)
+        wrong = min(least) < 1
         if wrong or not self.modes or len(set(self.modes)) < len(self.modes):
             raise PolicyError(
                 "these settings evaluate nothing",
-                expected="episodes and every at least 1, first and seed at least 0, "
+                expected="episodes and every at least 1, first, learning and seed at least 0, "
                 "one or two different modes",
                 got=self,
             )
 
     def rows(self, snapshots: int) -> list[int]:
-        """The snapshots to be evaluated of a run that has so many."""
+        """Return the snapshots to be evaluated of a run, leaving its learning phase aside."""
         chosen = {*range(0, snapshots, self.every), *range(min(self.first, snapshots))}
         return sorted(chosen | {snapshots - 1}) if snapshots else []
 
@@ -85,6 +90,7 @@ class ReturnsConfig:
             deterministic=tuple(mode == "deterministic" for mode in self.modes for _ in seeds),
             every=self.every,
             first=self.first,
+            learning=self.learning,
             simulator=simulator,
             packages={
                 name: importlib.metadata.version(name)
@@ -175,7 +181,6 @@ class _Work:
         self._journal = _Journal(folder / f"{run.id}.jsonl", self._header())
         self.played = self._stored(replace=replace) | self._journal.rows
         self.unsaved = len(self._journal.rows)
-        self.missing = [row for row in config.rows(len(run)) if row not in self.played]
         packed = Path(run.path).suffix == PACKED
         if self.missing and run.info.evaluation is not None and not packed:
             raise PolicyError(
@@ -186,6 +191,16 @@ class _Work:
                 do="pack the run (weighttraj.pack), remove its folder, and give the command again",
             )
 
+    @property
+    def missing(self) -> list[int]:
+        """Snapshots that are still to be played, as far as they are known."""
+        missing = [row for row in self.config.rows(len(self.run)) if row not in self.played]
+        if missing or not self.config.learning:
+            return missing
+        # Only now the returns tell how far the learning phase goes.
+        dense = range(0, self._learned() + 1, self.config.learning)
+        return [row for row in dense if row not in self.played]
+
     def begin(self) -> None:
         """Begin the journal; store what an earlier one holds, if that is all."""
         self._journal.begin()
@@ -193,17 +208,18 @@ class _Work:
             self.save()
 
     def tasks(self) -> Iterator[_Task]:
-        """The missing snapshots in blocks."""
-        for start in range(0, len(self.missing), BLOCK):
-            rows = self.missing[start : start + BLOCK]
+        """Yield the missing snapshots in blocks."""
+        missing = self.missing
+        for start in range(0, len(missing), BLOCK):
+            rows = missing[start : start + BLOCK]
             yield _Task(path=Path(self.run.path), rows=rows, config=self.config)
 
     def add(self, rows: list[int], played: EpisodeReturns) -> None:
-        """Keep the outcome of a block; store everything in the run if it was the last."""
+        """Keep the outcome of a block; store everything in the run if nothing is missing."""
         new = {row: (played.returns[i], played.lengths[i]) for i, row in enumerate(rows)}
         self._journal.append(new)
         self.played |= new
-        if all(row in self.played for row in self.missing):
+        if not self.missing:
             self.save()
 
     def save(self) -> None:
@@ -214,6 +230,18 @@ class _Work:
             returns[row], lengths[row] = row_returns, row_lengths
         store_returns(Path(self.run.path), self.evaluation, returns, lengths)
         self._journal.remove()
+
+    def _learned(self) -> int:
+        """Return where the learning phase ends, by sampled actions if there are any.
+
+        Only the snapshots outside the dense part tell: the answer must not change as it is played.
+        """
+        deterministic = np.array(self.evaluation.deterministic)
+        columns = ~deterministic if not deterministic.all() else deterministic
+        means = np.full(len(self.run), np.nan)
+        for row in self.config.rows(len(self.run)):
+            means[row] = self.played[row][0][columns].mean()
+        return learning_phase(means)
 
     def _stored(self, *, replace: bool) -> _Played:
         before = self.run.info.evaluation
@@ -243,6 +271,7 @@ class _Work:
         """What a journal must begin with to be of this run and these settings."""
         digest = self.run["digest"][-1].tobytes().hex() if len(self.run) else ""
         told = asdict(self.evaluation) | {"digest": digest, "snapshots": len(self.run)}
+        del told["learning"]  # as `every` and `first`, it does not change how episodes are played
         header: dict[str, Any] = json.loads(json.dumps(told | {"every": None, "first": None}))
         return header
 
@@ -330,7 +359,6 @@ def _play(works: Sequence[_Work], engine: Engine, console: Console) -> None:
         console.print(f"{', '.join(slow)}: no batched physics, so Gymnasium's own loop, slowly")
     for work in works:
         work.begin()
-    tasks = [(work, task) for work in works for task in work.tasks()]
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -342,15 +370,18 @@ def _play(works: Sequence[_Work], engine: Engine, console: Console) -> None:
         TextColumn("left"),
     )
     with LoggedProgress(*columns, console=console) as progress:
-        bar = progress.add_task("returns", total=sum(len(task.rows) for _, task in tasks))
-        work_of = {(task.path, task.rows[0]): work for work, task in tasks}
-        # Nothing is lost with a worker that is stopped at once.
-        outcomes = engine.run(play_rows, [task for _, task in tasks], lambda: None, wait=False)
-        for task, played in outcomes:
-            if isinstance(played, Exception):
-                raise played
-            work_of[task.path, task.rows[0]].add(task.rows, played)
-            progress.advance(bar, len(task.rows))
+        bar = progress.add_task("returns", total=0)
+        # What is missing of a learning phase is known once the other snapshots have been played.
+        while tasks := {(t.path, t.rows[0]): (work, t) for work in works for t in work.tasks()}:
+            total = progress.tasks[bar].completed + sum(len(t.rows) for _, t in tasks.values())
+            progress.update(bar, total=total)
+            # Nothing is lost with a worker that is stopped at once.
+            blocks = [task for _, task in tasks.values()]
+            for task, played in engine.run(play_rows, blocks, lambda: None, wait=False):
+                if isinstance(played, Exception):
+                    raise played
+                tasks[task.path, task.rows[0]][0].add(task.rows, played)
+                progress.advance(bar, len(task.rows))
 
 
 def _is_slow(work: _Work) -> bool:
