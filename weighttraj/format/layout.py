@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 from numpy.typing import ArrayLike
 
 from weighttraj.errors import FormatError, SnapshotError
+from weighttraj.format.values import as_array
 
 Role = Literal["weight", "bias", "log_std", "other"]
 
@@ -108,24 +109,31 @@ class ParamLayout:
                 return spec
         raise KeyError(f"no parameter {name!r}; there are {[s.name for s in self.params]}")
 
-    def flatten(self, tensors: Mapping[str, ArrayLike]) -> Float32[np.ndarray, " param"]:
+    def flatten(self, tensors: Mapping[str, ArrayLike | Any]) -> Float32[np.ndarray, " param"]:
         """Join named tensors into one float32 vector.
 
+        Args:
+            tensors: arrays or tensors of any real type, which may require a gradient, by name;
+                ``module.state_dict()``, for example. Names that the layout lacks are left out.
+
         Raises:
-            SnapshotError: a tensor is missing or has another shape than the layout's.
+            SnapshotError: a tensor is missing, has another shape than the layout's, or does not
+                consist of real numbers that float32 can hold.
         """
         flat = np.empty(self.size, np.float32)
         for spec in self.params:
-            got = np.shape(tensors[spec.name]) if spec.name in tensors else "no such tensor"
-            if got != spec.shape:
+            where = f"parameter {spec.name!r}"
+            there = spec.name in tensors
+            part = as_array(tensors[spec.name], "float32", where) if there else None
+            if part is None or part.shape != spec.shape:
                 raise SnapshotError(
                     "the tensors do not follow the layout",
                     expected=spec.shape,
-                    got=got,
-                    where=f"parameter {spec.name!r}",
+                    got="no such tensor" if part is None else part.shape,
+                    where=where,
                     do="use the layout of the policy that these tensors come from",
                 )
-            flat[spec.slice] = np.asarray(tensors[spec.name], np.float32).reshape(-1)
+            flat[spec.slice] = part.reshape(-1)
         return flat
 
     def unflatten(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
-from jaxtyping import Float32
+from numpy.typing import ArrayLike
 
 from weighttraj.errors import FormatError, ReplayError, SnapshotError, StoreLockedError
 from weighttraj.format.live import LiveStore
@@ -25,6 +25,7 @@ from weighttraj.format.schema import (
     to_json,
     with_progress,
 )
+from weighttraj.format.values import as_array
 
 Moments = tuple[np.ndarray, np.ndarray, float]
 """Statistics of a normaliser: mean, variance, count."""
@@ -88,43 +89,49 @@ class RunWriter:
 
     def append(
         self,
-        weights: Float32[np.ndarray, " param"],
+        weights: ArrayLike | Any,
         *,
-        num_timesteps: int,
-        iteration: int = -1,
-        epoch: int = -1,
-        gradient_step: int = -1,
-        phase: int = -1,
-        learning_rate: float = float("nan"),
-        obs_norm: Moments | None = None,
-        ret_norm: Moments | None = None,
-        train: Mapping[str, float] | None = None,
-        critic: Float32[np.ndarray, " critic_param"] | None = None,
-        moments: tuple[np.ndarray, np.ndarray] | None = None,
+        num_timesteps: int | Any,
+        iteration: int | Any = -1,
+        epoch: int | Any = -1,
+        gradient_step: int | Any = -1,
+        phase: int | Any = -1,
+        learning_rate: float | Any = float("nan"),
+        obs_norm: Moments | Any | None = None,
+        ret_norm: Moments | Any | None = None,
+        train: Mapping[str, float | Any] | None = None,
+        critic: ArrayLike | Any | None = None,
+        moments: tuple[ArrayLike, ArrayLike] | Any | None = None,
     ) -> None:
         """Append one snapshot.
 
+        Arrays may be NumPy arrays or tensors of any real type; they are stored as float32 or
+        float64. Every value is checked when it arrives, whatever its type: nothing that the
+        stored type cannot hold is accepted.
+
         Args:
-            weights: flat parameters, in the order of ``info.layout``.
+            weights: flat parameters (param,), in the order of ``info.layout``.
             num_timesteps: environment steps so far.
-            iteration: rollouts and updates begun so far; 0 before training, -1: not said.
-            epoch: passes over the rollout finished in this iteration; -1: not said.
-            gradient_step: optimizer steps so far; -1: not said.
-            phase: which part of the iteration ends here, from 0; -1: none, or not said.
+            iteration: rollouts and updates begun so far; 0 before training, -1: not recorded.
+            epoch: passes over the rollout finished in this iteration; -1: not recorded.
+            gradient_step: optimizer steps so far; -1: not recorded.
+            phase: which part of the iteration ends here, from 0; -1: none, or not recorded.
             learning_rate: of the gradient step that led here.
             obs_norm: (mean, var, count) of the observation normaliser, float64 of an observation's
                 shape and a number; required if ``info.obs_norm``.
             ret_norm: the same of the reward normaliser, scalars; required if ``info.ret_norm``.
             train: diagnostics known at this moment; NaN is stored for those left out.
-            critic: critic's parameters; required if ``info.critic_layout``.
+            critic: critic's parameters (critic_param,); required if ``info.critic_layout``.
             moments: Adam's first and second moments; required if ``info.optimizer_moments``.
 
         Raises:
-            SnapshotError: a value has another shape than the run's, is not finite, or is missing.
+            SnapshotError: a value has another shape than the run's, does not consist of real
+                numbers, is not finite, or is missing.
             ReplayError: a continued run does not repeat what it had committed.
         """
+        flat = as_array(weights, "float32", "policy/weights")
         values: dict[str, Any] = {
-            "policy/weights": weights,
+            "policy/weights": flat,
             "index/learning_rate": learning_rate,
             "index/iteration": iteration,
             "index/epoch": epoch,
@@ -135,14 +142,17 @@ class RunWriter:
             **_moments("obs_norm", obs_norm),
             **_moments("ret_norm", ret_norm),
             **({} if critic is None else {"critic/weights": critic}),
-            **({} if moments is None else dict(zip(_ADAM, moments, strict=True))),
+            **_named("moments", _ADAM, moments),
         }
-        digest = hashlib.sha256(np.ascontiguousarray(weights, "<f4").tobytes()).digest()
+        digest = hashlib.sha256(np.ascontiguousarray(flat, "<f4").tobytes()).digest()
         values["digest"] = np.frombuffer(digest, np.uint8)
         self._append("time", values)
 
-    def append_iteration(self, probe_observations: Float32[np.ndarray, "probe *obs"]) -> None:
+    def append_iteration(self, probe_observations: ArrayLike | Any) -> None:
         """Append one row of the iteration-indexed arrays: network inputs of its rollout.
+
+        Args:
+            probe_observations: (probe, *obs).
 
         Raises:
             SnapshotError: the shape is not ``(info.probe_observations, *observation)``.
@@ -318,10 +328,22 @@ def explain_difference(stored: Provenance, now: Provenance) -> str:
     return f"in other circumstances: {'; '.join(other)}"
 
 
-def _moments(name: str, moments: Moments | None) -> dict[str, Any]:
-    if moments is None:
+def _moments(name: str, moments: Moments | Any | None) -> dict[str, Any]:
+    return _named(name, (f"{name}/mean", f"{name}/var", f"{name}/count"), moments)
+
+
+def _named(what: str, names: Sequence[str], values: Any) -> dict[str, Any]:
+    """Return the values by the arrays that they belong to; nothing where there are none."""
+    if values is None:
         return {}
-    return dict(zip((f"{name}/mean", f"{name}/var", f"{name}/count"), moments, strict=True))
+    if not isinstance(values, list | tuple) or len(values) != len(names):
+        raise SnapshotError(
+            f"the snapshot's {what} has another number of values than the run stores",
+            expected=f"a tuple of {len(names)}: {', '.join(names)}",
+            got=f"{type(values).__name__} of {len(values) if hasattr(values, '__len__') else 1}",
+            do=f"pass {what}=({', '.join(n.rpartition('/')[2] for n in names)})",
+        )
+    return dict(zip(names, values, strict=True))
 
 
 def _rows(specs: Sequence[ArraySpec], values: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -338,7 +360,7 @@ def _rows(specs: Sequence[ArraySpec], values: Mapping[str, Any]) -> dict[str, np
             )
         if value is None:
             value = np.full(spec.inner, spec.fill)
-        row = np.array(value, spec.dtype)
+        row = as_array(value, spec.dtype, spec.name)
         if row.shape != spec.inner:
             raise SnapshotError(
                 "a value of the snapshot has the wrong shape",
@@ -346,6 +368,14 @@ def _rows(specs: Sequence[ArraySpec], values: Mapping[str, Any]) -> dict[str, np
                 got=row.shape,
                 where=spec.name,
                 do="pass what the run's layout and normaliser describe",
+            )
+        if row.dtype.kind == "i" and row.min(initial=-1) < -1:
+            raise SnapshotError(
+                "a counter of the snapshot is negative",
+                expected="at least 0, or -1 for not recorded",
+                got=value,
+                where=spec.name,
+                do="count from 0",
             )
         if not optional and row.dtype.kind == "f" and not np.isfinite(row).all():
             check_finite(spec.name, row)
