@@ -22,7 +22,13 @@ from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecNormalize,
+)
 
 import weighttraj as wt
 from tests.small import CONFIGS, SMALL, learn
@@ -463,3 +469,116 @@ def test_ambiguous_normalisers_are_refused(
     with pytest.raises(CollectError, match=message):
         model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
     model.get_env().close()  # type: ignore[union-attr]
+
+
+# Wrappers: which leave the policy as it is, and which do not
+
+
+class PaidTwice(gym.RewardWrapper):  # type: ignore[type-arg]
+    def reward(self, reward: Any) -> float:
+        return 2 * float(reward) + float(np.abs(self.unwrapped.state).sum())  # type: ignore[attr-defined]
+
+
+class PaidByStep(gym.Wrapper):  # type: ignore[type-arg]
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, float(reward) + 1, terminated, truncated, info
+
+
+class PaidTogether(VecEnvWrapper):
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        return observations, rewards * 3, dones, infos
+
+
+class Blinking(gym.Wrapper):  # type: ignore[type-arg]
+    """Hides an observation now and then."""
+
+    steps = 0
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        observation, *rest = self.env.step(action)
+        return (observation * (self.steps % 20 > 0), *rest)
+
+
+class Sticky(gym.Wrapper):  # type: ignore[type-arg]
+    """Repeats the last action now and then, by the global generator."""
+
+    last: Any = None
+
+    def step(self, action: Any) -> Any:
+        self.last = self.last if self.last is not None and np.random.random() < 0.2 else action
+        return self.env.step(self.last)
+
+
+class Aged(gym.wrappers.TimeLimit):  # type: ignore[type-arg]
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        return (observation * 0.5, *rest)
+
+
+class Halved(VecNormalize):
+    def normalize_obs(self, obs: Any) -> Any:
+        return super().normalize_obs(obs) / 2  # type: ignore[operator]
+
+
+class Scaled(VecEnvWrapper):
+    def reset(self) -> Any:
+        return 2 * self.venv.reset()  # type: ignore[operator]
+
+    def step_wait(self) -> Any:
+        observations, *rest = self.venv.step_wait()
+        return (2 * observations, *rest)  # type: ignore[operator]
+
+
+def pendulum(wrap: Callable[[Any], Any] = lambda env: env, vec: Any = None) -> Any:
+    env = DummyVecEnv([lambda: wrap(gym.make("Pendulum-v1"))] * 2)
+    return vec(env) if vec else env
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: pendulum(PaidTwice), "PaidTwice"),
+        (lambda: pendulum(PaidByStep), "PaidByStep"),
+        (lambda: VecNormalize(pendulum(PaidTwice)), "PaidTwice"),
+        (lambda: pendulum(vec=PaidTogether), "PaidTogether"),
+    ],
+)
+def test_a_wrapper_of_rewards_leaves_the_policy_and_hides_the_environment(
+    make: Callable[[], Any], name: str, tmp_path: Path
+) -> None:
+    env = make()
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, device="cpu")
+    model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    run = wt.open_run(tmp_path / "run.zarr")
+    raw = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    inputs = env.normalize_obs(raw) if isinstance(env, VecNormalize) else raw
+    expected = model.predict(inputs, deterministic=True)[0]
+    assert np.array_equal(run.load_policy().predict(raw, deterministic=True)[0], expected)
+    with pytest.raises(PolicyError, match=f"cannot be made again.*\n.*\n.*wrapper {name}"):
+        wt.policies.evaluate(run.load_policy(), run, episodes=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: pendulum(Blinking), "Blinking"),
+        (lambda: pendulum(Sticky), "Sticky"),
+        (lambda: pendulum(lambda env: Aged(env, 100)), "Aged"),
+        (lambda: pendulum(vec=Halved), "Halved"),
+        (lambda: pendulum(vec=Scaled), "Scaled"),
+    ],
+)
+def test_a_wrapper_that_changes_observations_or_actions_is_named(
+    make: Callable[[], Any], name: str, tmp_path: Path
+) -> None:
+    model = PPO("MlpPolicy", make(), n_steps=32, batch_size=32, n_epochs=1, device="cpu")
+    model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    run = wt.open_run(tmp_path / "run.zarr")
+    with pytest.raises(PolicyError, match=f"environment wrapper {name}"):
+        run.load_policy()

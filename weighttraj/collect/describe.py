@@ -145,7 +145,7 @@ def describe_run(
         run_id=run_id,
         layout=describe_layout(actor_parameters(model.policy), policy),
         policy=policy,
-        env=describe_env(model, norm.wrappers),
+        env=describe_env(model, norm),
         algorithm=describe_algorithm(model),
         seed=model.seed,
         cadence=describe_cadence(model, every),
@@ -217,7 +217,7 @@ def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
     return {"head": "other"}, [f"actions in {space}"]
 
 
-def describe_env(model: OnPolicyAlgorithm, wrappers: tuple[str, ...]) -> EnvInfo | None:
+def describe_env(model: OnPolicyAlgorithm, norm: Normalizers) -> EnvInfo | None:
     """The environment as Gymnasium's registry knows it; None: it is not registered."""
     spec = model.env.get_attr("spec", indices=[0])[0] if model.env is not None else None
     if spec is None:
@@ -227,7 +227,8 @@ def describe_env(model: OnPolicyAlgorithm, wrappers: tuple[str, ...]) -> EnvInfo
         kwargs=_plain(spec.kwargs),
         max_episode_steps=spec.max_episode_steps,
         spec={"entry_point": str(spec.entry_point), "reward_threshold": spec.reward_threshold},
-        wrappers=wrappers,
+        wrappers=norm.wrappers,
+        cannot_remake=tuple(f"environment wrapper {n}" for n in (*norm.unknown, *norm.rewarding)),
     )
 
 

@@ -21,13 +21,14 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from weighttraj.collect.transparent import is_transparent, is_transparent_vec
 from weighttraj.collect.wrappers import ClipObservation, TruncationAsTermination
 from weighttraj.errors import CollectError
 from weighttraj.format.schema import ObsNorm
 from weighttraj.format.writer import Moments
 
 # Wrappers that leave observations alone and do not change what an action means: SB3 clips
-# actions to the space's bounds anyway. Those that touch only rewards count as such.
+# actions to the space's bounds anyway. Their subclasses are tried like any other wrapper.
 _HARMLESS: tuple[type, ...] = (
     gw.TimeLimit,
     gw.OrderEnforcing,
@@ -37,6 +38,7 @@ _HARMLESS: tuple[type, ...] = (
     gw.ClipAction,
     gw.NormalizeReward,
     gw.TransformReward,
+    gw.ClipReward,
     Monitor,
     TruncationAsTermination,
 )
@@ -56,7 +58,9 @@ class Normalizers:
     wrappers: tuple[str, ...]
     """Class names of all wrappers, outermost first."""
     unknown: tuple[str, ...]
-    """Wrappers that change observations or actions in a way that cannot be recorded."""
+    """Wrappers that may change observations or actions in a way that cannot be recorded."""
+    rewarding: tuple[str, ...]
+    """Wrappers that leave observations and actions alone, and may change rewards and episodes."""
 
 
 def find_normalizers(env: VecEnv) -> Normalizers:
@@ -66,11 +70,11 @@ def find_normalizers(env: VecEnv) -> Normalizers:
         CollectError: several environments have a normaliser each, or normalisers are stacked.
     """
     vec_wrappers, base = _unwrap(env, VecEnvWrapper, "venv")
-    vec_normalize = [w for w in vec_wrappers if isinstance(w, VecNormalize)]
-    known_vec = (*_HARMLESS_VEC, VecNormalize)
-    unknown = [type(w).__name__ for w in vec_wrappers if not isinstance(w, known_vec)]
-    chain, obs_sources, ret_sources = _inner_wrappers(base)
-    unknown += [type(w).__name__ for i, w in enumerate(chain) if not _is_known(w, chain[i + 1 :])]
+    vec_normalize = [w for w in vec_wrappers if type(w) is VecNormalize]
+    chains = _chains(base)
+    chain, obs_sources, ret_sources = _inner_wrappers(base, chains)
+    strange = _strange(vec_wrappers, chains)
+    unknown = [name for name, transparent in strange.items() if not transparent]
     unknown += _unknown_by_name(base)
 
     sources = [_gymnasium_obs(chain, w) for w in obs_sources]
@@ -92,12 +96,22 @@ def find_normalizers(env: VecEnv) -> Normalizers:
         read_ret=(lambda: _copy(ret_stats[0])) if ret_stats else None,
         wrappers=tuple(type(w).__name__ for w in (*vec_wrappers, base, *chain)),
         unknown=tuple(unknown),
+        rewarding=tuple(name for name, transparent in strange.items() if transparent),
     )
 
 
-def _inner_wrappers(base: VecEnv) -> tuple[list[Any], list[Any], list[Any]]:
-    """Wrappers of one inner environment, and the normalisers among them."""
+def _chains(base: VecEnv) -> list[list[Any]]:
+    """Wrappers of each environment, outermost first; empty: they live in other processes."""
     if not isinstance(base, DummyVecEnv):
+        return []
+    return [_unwrap(env, gym.Wrapper, "env")[0] for env in base.envs]
+
+
+def _inner_wrappers(
+    base: VecEnv, chains: list[list[Any]]
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Wrappers of the first environment, and the normalisers among them."""
+    if not chains:
         if any(base.env_is_wrapped(gw.NormalizeObservation)):
             raise CollectError(
                 "the observation normalisers live in other processes",
@@ -106,8 +120,7 @@ def _inner_wrappers(base: VecEnv) -> tuple[list[Any], list[Any], list[Any]]:
                 do="normalise with VecNormalize instead",
             )
         return [], [], []
-    chains = [_unwrap(env, gym.Wrapper, "env")[0] for env in base.envs]
-    obs = [w for w in chains[0] if isinstance(w, gw.NormalizeObservation)]
+    obs = [w for w in chains[0] if type(w) is gw.NormalizeObservation]
     if obs and len(chains) > 1:
         raise CollectError(
             "each environment has an observation normaliser of its own, so no single policy "
@@ -116,18 +129,34 @@ def _inner_wrappers(base: VecEnv) -> tuple[list[Any], list[Any], list[Any]]:
             got=f"{len(chains)} environments",
             do="train with n_envs=1, or normalise with VecNormalize",
         )
-    ret = [w for w in chains[0] if isinstance(w, gw.NormalizeReward)] if len(chains) == 1 else []
+    ret = [w for w in chains[0] if type(w) is gw.NormalizeReward] if len(chains) == 1 else []
     return chains[0], obs, ret
 
 
+def _strange(vec_wrappers: list[Any], chains: list[list[Any]]) -> dict[str, bool]:
+    """Names of the wrappers that are not known, and whether observations and actions pass them."""
+    known = (*_HARMLESS_VEC, VecNormalize)
+    tried = [
+        (type(w).__name__, is_transparent_vec(w)) for w in vec_wrappers if type(w) not in known
+    ]
+    tried += [
+        (type(wrapper).__name__, is_transparent(wrapper))
+        for chain in chains
+        for i, wrapper in enumerate(chain)
+        if not _is_known(wrapper, chain[i + 1 :])
+    ]
+    return {name: all(ok for other, ok in tried if other == name) for name, _ in tried}
+
+
 def _unknown_by_name(base: VecEnv) -> list[str]:
-    """Unknown wrappers of the environments that cannot be looked into: all but the first here."""
-    texts = base.env_method("__str__")[1 if isinstance(base, DummyVecEnv) else 0 :]
+    """Names of the unknown wrappers of environments that live in other processes."""
+    if isinstance(base, DummyVecEnv):
+        return []
     # "<Wrapper<Env<Id-v0>>>", or "<Wrapper<Env instance>>" where there is no id
-    texts = [re.sub(r"<\w+<[^<> ]*>>", "", text) for text in texts]
+    texts = [re.sub(r"<\w+<[^<> ]*>>", "", text) for text in base.env_method("__str__")]
     names = {name for text in texts for name in re.findall(r"<(\w+)(?![\w ])", text)}
     known = {kind.__name__ for kind in (*_HARMLESS, gw.NormalizeObservation, ClipObservation)}
-    return sorted(names - known - {"ClipReward"})
+    return sorted(names - known)
 
 
 def _unwrap(env: Any, kind: type, attribute: str) -> tuple[list[Any], Any]:
@@ -142,9 +171,9 @@ def _is_known(wrapper: Any, inside: list[Any]) -> bool:
     if _clip_bounds(wrapper) is not None:
         # Recorded as the normaliser's clip, so there must be a normaliser inside.
         return any(isinstance(w, gw.NormalizeObservation) for w in inside)
-    if isinstance(wrapper, gw.FlattenObservation):
+    if type(wrapper) is gw.FlattenObservation:
         return len(wrapper.env.observation_space.shape or ()) == 1
-    return isinstance(wrapper, (*_HARMLESS, gw.NormalizeObservation))
+    return type(wrapper) in (*_HARMLESS, gw.NormalizeObservation)
 
 
 def _has_array_stats(wrapper: VecNormalize) -> bool:
@@ -187,13 +216,13 @@ def _clip_bounds(wrapper: Any) -> tuple[float, float] | None:
 
     CleanRL clips by a lambda. It cannot be read, but it can be asked.
     """
-    if isinstance(wrapper, ClipObservation):
+    if type(wrapper) is ClipObservation:
         return wrapper.low, wrapper.high
     func = getattr(wrapper, "func", None)
     # Asked only if asking cannot change it: a function without a state of its own.
     if not isinstance(func, FunctionType) or func.__closure__ is not None:
         return None
-    if not isinstance(wrapper, gw.TransformObservation):
+    if type(wrapper) is not gw.TransformObservation:
         return None
     shape = wrapper.env.observation_space.shape or ()
     probes = np.random.default_rng(0).normal(size=(64, *shape)).astype(np.float32)

@@ -9,10 +9,8 @@ difference. A learner's bits depend on its seed alone, not on those beside it.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -29,6 +27,7 @@ from weighttraj.collect.networks import MLP, Stack
 from weighttraj.collect.ppo import PPOConfig, make_ppo
 from weighttraj.collect.recorder import Reading
 from weighttraj.collect.rollouts import Environments, check_kernel
+from weighttraj.collect.undisturbed import undisturbed
 from weighttraj.errors import CollectError
 
 _SERIAL = 15
@@ -67,7 +66,7 @@ class Origin:
     def __init__(self, config: PPOConfig, seed: int) -> None:
         self.seed = seed
         self.noise, self.shuffle = torch.Generator(), np.random.RandomState()
-        with _undisturbed():
+        with undisturbed():
             self.model = make_ppo(config, seed=seed)
             self.noise.set_state(torch.get_rng_state())
             self.shuffle.set_state(np.random.get_state())  # noqa: NPY002 (SB3 uses it)
@@ -261,18 +260,6 @@ def _after_step(watchers: Sequence[Watcher]) -> Callable[[], None]:
             watcher.end_gradient_step()
 
     return tell
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Leave the global generators as they were."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
 
 
 def _stack(origins: Sequence[Origin]) -> Stack:

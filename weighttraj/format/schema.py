@@ -92,6 +92,8 @@ class EnvInfo:
     """What else the registry says of it, for the record; nothing is rebuilt from it."""
     wrappers: tuple[str, ...] = ()
     """Class names of the wrappers, outermost first."""
+    cannot_remake: tuple[str, ...] = ()
+    """Reasons why the environment cannot be made again from this description; empty: it can."""
 
 
 @dataclass(frozen=True, kw_only=True)

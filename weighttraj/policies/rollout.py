@@ -252,13 +252,22 @@ def env_of(run: Run) -> EnvInfo:
     """The environment of a run.
 
     Raises:
-        PolicyError: the run does not say, or names files: those of a data set are not to be opened.
+        PolicyError: the run does not say, the environment cannot be made again, or it is made from
+            files: those that a data set names are not to be opened.
     """
     if run.info.env is None:
         raise PolicyError(
             "the run does not say which environment it was trained in",
             where=run.path,
             do="pass weighttraj.format.EnvInfo(id=...) instead of the run",
+        )
+    if run.info.env.cannot_remake:
+        raise PolicyError(
+            "the run's environment cannot be made again, so its policies cannot be evaluated in it",
+            expected="an environment that gymnasium.make makes from its id and keywords",
+            got="; ".join(run.info.env.cannot_remake),
+            where=run.path,
+            do="make the environment yourself and act in it with run.load_policy(t)",
         )
     paths = [v for v in run.info.env.kwargs.values() if isinstance(v, str) and set(v) & set("/\\")]
     if paths:
