@@ -214,6 +214,18 @@ def _combine(
     print(registry.combine(paths, out, console=console))
 
 
+@app.command(name="select")
+def _select(
+    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set: path or id")],
+    seeds: Annotated[str, tyro.conf.arg(help="seeds of the runs, such as 0:4,30,40:44")],
+    out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
+) -> None:
+    """Make a data set of some runs of another one; it says which part it is of what."""
+    from weighttraj.collect.recipe import parse_seeds
+
+    print(registry.select(path, out, seeds=parse_seeds(seeds), console=console))
+
+
 @app.command(name="split")
 def _split(
     path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set: path or id")],

@@ -23,6 +23,7 @@ from rich.console import Console
 import weighttraj as wt
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe
+from weighttraj.collect.costs import read_costs
 from weighttraj.collect.recipe import Seeds, Store, parse_seeds
 from weighttraj.collect.tasks import Task, collect_block
 from weighttraj.errors import CollectError, EngineError, RecipeError
@@ -171,6 +172,18 @@ def test_collecting_again_does_nothing(tmp_path: Path) -> None:
     collect(one_seed(), out, console=Console(file=screen))
     assert "seed 0: complete, 49 snapshots" in screen.getvalue()
     assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
+
+
+def test_what_a_collection_took_is_written_down_once(tmp_path: Path) -> None:
+    recipe = replace(SMALL_RECIPE, ppo=replace(SMALL_RECIPE.ppo, total_timesteps=64))
+    collect(recipe, tmp_path / "costs", seeds=[0])
+    collect(recipe, tmp_path / "costs", seeds=[0, 2], workers=2)
+    collect(recipe, tmp_path / "costs", seeds=[0, 2])  # there is nothing left to do
+    first, second = read_costs(tmp_path / "costs")
+    assert (first["seeds"], second["seeds"]) == ([0], [2])
+    assert min(first["cpu_s"], second["cpu_s"]) > 0
+    collect(recipe, tmp_path / "costs")
+    assert wt.verify(tmp_path / "costs") == []  # it is no object of the data set
 
 
 def test_it_says_for_whom_it_waits(small_dataset: Path, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from weighttraj.errors import (
 )
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.format.locate import VARIABLE, clone, locate
-from weighttraj.registry import combine, create, delete, local_datasets, search, split
+from weighttraj.registry import combine, create, delete, local_datasets, search, select, split
 from weighttraj.registry.derive import SPLITS, _parts
 
 
@@ -349,3 +349,43 @@ def test_the_commands(store: Path, tmp_path: Path) -> None:
     assert str(store / "small") in unasked.stdout.replace("\n", "")
     assert shell("weighttraj", "delete", "small", "--yes").returncode == 0
     assert not (store / "small").exists()
+
+
+# A part of a recipe
+
+
+def test_a_part_says_what_it_is_of_and_keeps_recipe_splits_and_bytes(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    whole = wt.open(small_dataset)
+    kept = [run for run in whole if run.split != "validation"]
+    part = select(small_dataset, tmp_path / "part", seeds=[run.info.seed or 0 for run in kept])
+    assert part.info.id == whole.info.id
+    assert part.info.part == f"{len(kept)} of {len(whole)}"
+    assert not whole.info.part
+    assert f"({len(kept)} of {len(whole)} runs of the whole)" in repr(part)
+    assert wt.verify(tmp_path / "part", deep=True) == []
+    assert wt.lint(tmp_path / "part") == wt.lint(small_dataset)
+    for run, original in zip(part, kept, strict=True):
+        assert run.split == original.split
+        assert run["digest"][:].tobytes() == original["digest"][:].tobytes()
+    assert part.info.recipe["ppo"] == whole.info.recipe["ppo"]
+    assert replay(tmp_path / "part", 3) == []
+
+
+def test_a_part_without_runs_of_a_split_says_so(small_dataset: Path, tmp_path: Path) -> None:
+    seed = wt.open(small_dataset).split("train").runs[0].info.seed
+    part = select(small_dataset, tmp_path / "part", seeds=[seed or 0])
+    with pytest.raises(FormatError, match="holds no run of this split") as caught:
+        part.split("test")
+    assert "1 of 4 runs" in str(caught.value)
+    assert "weighttraj collect" in str(caught.value)
+
+
+def test_seeds_without_complete_runs_are_refused(small_dataset: Path, tmp_path: Path) -> None:
+    for seeds in ([0, 99], []):
+        with pytest.raises(RegistryError, match="no complete runs of these seeds"):
+            select(small_dataset, tmp_path / "part", seeds=seeds)
+    assert not (tmp_path / "part").exists()
+    done = shell("weighttraj", "select", small_dataset, "--seeds", "0", "--out", tmp_path / "part")
+    assert "1 of 4 runs of the whole" in done.stdout

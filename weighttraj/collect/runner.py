@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from weighttraj.collect.costs import measured
 from weighttraj.collect.population import check_config
 from weighttraj.collect.recipe import Collect, Recipe
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
@@ -69,7 +70,8 @@ def collect(
         check_config(recipe.ppo)
     out = Path(out).absolute()
     console = console or Console(quiet=True)
-    with engine_of(workers, scheduler) as engine:
+    # The engine is closed first: then the seconds of its processes are known.
+    with measured(out, lambda: _packed_seeds(out)), engine_of(workers, scheduler) as engine:
         out.mkdir(parents=True, exist_ok=True)
         with _lock(out, console):
             info = _prepare(recipe, out, seeds)
@@ -152,6 +154,15 @@ def _settled(out: Path, entry: RunEntry) -> RunEntry:
         shutil.rmtree(out / folder)
         (out / f"{folder}.lock").unlink(missing_ok=True)
     return replace(entry, path=packed)
+
+
+def _packed_seeds(out: Path) -> list[int]:
+    """Return the seeds of the runs that are finished; none if there is no data set yet."""
+    if not (out / "dataset.json").is_file():
+        return []
+    runs = read_dataset_info(out).runs
+    files = {run.seed: f"{run.path.removesuffix(PACKED)}{PACKED}" for run in runs}
+    return [seed for seed, name in files.items() if seed is not None and (out / name).is_file()]
 
 
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:

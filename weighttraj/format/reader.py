@@ -366,19 +366,22 @@ class Dataset:
         self.runs = list(runs)
 
     def split(self, name: Literal["train", "validation", "test"]) -> Dataset:
-        """The runs of one part.
+        """Return the runs of one split.
 
         Raises:
-            FormatError: the part has no runs.
+            FormatError: if the split has no runs.
         """
         runs = [run for run in self.runs if run.split == name]
         if not runs:
+            part = self.info.part
             raise FormatError(
-                "this part of the data set has no runs",
-                expected="a split that dataset.json names",
-                got=f"{name!r}; there are {sorted({run.split for run in self.runs})}",
-                where=self.path,
-                do="name the split of each seed in the recipe",
+                "the data set holds no run of this split",
+                expected=f"one of {sorted({run.split for run in self.runs if run.split})}",
+                got=repr(name),
+                where=f"{self.path}{f', which holds {part} runs of the whole' if part else ''}",
+                do=f"collect the other runs of {self.info.id}: weighttraj collect RECIPE"
+                if part
+                else "name the split of each seed in the recipe",
             )
         return Dataset(self.path, self.info, runs)
 
@@ -438,7 +441,8 @@ class Dataset:
         return iter(self.runs)
 
     def __repr__(self) -> str:
-        lines = [f"<Dataset {self.info.id} ({self.info.status}), {len(self)} runs>"]
+        whole = f" ({self.info.part} runs of the whole)" if self.info.part else ""
+        lines = [f"<Dataset {self.info.id} ({self.info.status}), {len(self)} runs{whole}>"]
         return "\n".join(lines + [f"  {run.split or '-':<10} {run!r}" for run in self.runs])
 
 

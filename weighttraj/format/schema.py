@@ -299,6 +299,13 @@ class DatasetInfo:
         if len(set(ids)) != len(ids):
             raise FormatError("run ids in a data set must be unique", got=ids, where=self.id)
 
+    @property
+    def part(self) -> str:
+        """How many runs of the whole it holds, such as ``10 of 50``; empty if it is the whole."""
+        part = self.recipe.get("part")
+        runs = part.get("runs") if isinstance(part, dict) else None
+        return runs if isinstance(runs, str) and re.fullmatch(r"\d+ of \d+", runs) else ""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ArraySpec:

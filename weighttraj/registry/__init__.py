@@ -6,7 +6,7 @@ here, and ``load`` opens it by its name, wherever it is.
 """
 
 from weighttraj.registry.card import write_card
-from weighttraj.registry.derive import combine, create, split
+from weighttraj.registry.derive import combine, create, select, split
 from weighttraj.registry.download import download
 from weighttraj.registry.load import load_dataset
 from weighttraj.registry.local import LocalDataset, delete, find, local_datasets
@@ -23,6 +23,7 @@ __all__ = [
     "load_dataset",
     "local_datasets",
     "search",
+    "select",
     "split",
     "upload",
     "write_card",

@@ -126,6 +126,49 @@ def combine(
     return _write(Path(out), info, chosen, console)
 
 
+def select(
+    path: str | Path,
+    out: str | Path,
+    *,
+    seeds: Sequence[int],
+    console: Console | None = None,
+) -> Dataset:
+    """Make a data set of some finished runs of another one: a part that can be published alone.
+
+    The part keeps id, version, splits and recipe, and its recipe says that it is a part. The other
+    runs may still be in collection.
+
+    Args:
+        path: data set: path or id.
+        out: folder of the new one.
+        seeds: of the runs that are wanted.
+        console: where progress is shown; None: nowhere.
+
+    Raises:
+        RegistryError: if a seed has no run, or its run is not complete.
+        StoreExistsError: if the folder exists.
+    """
+    dataset = open_dataset(path)
+    known = {run.info.seed: run for run in dataset if run.info.status == "complete"}
+    missing = [seed for seed in seeds if seed not in known]
+    if missing or not seeds:
+        raise RegistryError(
+            "the data set has no complete runs of these seeds",
+            expected=f"seeds among {sorted(seed for seed in known if seed is not None)}",
+            got=missing or "no seeds",
+            where=dataset.path,
+            do="collect them first, or choose others",
+        )
+    chosen = {known[seed].id: (known[seed], known[seed].split) for seed in dict.fromkeys(seeds)}
+    part = {
+        "id": dataset.info.id,
+        "version": dataset.info.version,
+        "runs": f"{len(chosen)} of {len(dataset.info.runs)}",
+    }
+    info = replace(dataset.info, recipe={**dataset.info.recipe, "part": part})
+    return _write(Path(out), info, chosen, console)
+
+
 def split(
     path: str | Path,
     out: str | Path,
@@ -242,4 +285,4 @@ def _copy(run: Run, target: Path, run_id: str) -> None:
         shutil.copyfile(packed, target)
 
 
-__all__ = ["SPLITS", "combine", "create", "split"]
+__all__ = ["SPLITS", "combine", "create", "select", "split"]
