@@ -20,6 +20,7 @@ from weighttraj.collect import (
     population,
 )
 from weighttraj.collect.learners import Rollout
+from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.population import Population, draw_normal, origins_of
 from weighttraj.collect.ppo import make_vec_env
 from weighttraj.collect.recipe import Collect, Seeds, Store
@@ -42,6 +43,35 @@ CHEETAH = PPOConfig(
     n_steps=256,
     n_epochs=2,
 )
+# As rl-zoo3 tunes PPO: everything that CleanRL does otherwise. An episode is cut off at 50 steps.
+TUNED = Recipe(
+    id="reacher",
+    ppo=PPOConfig(
+        env_id="Reacher-v4",
+        net_arch=(16, 9),
+        critic_arch=(24, 7),
+        activation="relu",
+        ortho_init=False,
+        log_std_init=-2.0,
+        total_timesteps=3 * 160,
+        n_steps=160,
+        batch_size=32,
+        n_epochs=4,
+        learning_rate=1e-3,
+        anneal_learning_rate=False,
+        clip_range=0.1,
+        clip_range_vf=None,
+        ent_coef=4e-4,
+        max_grad_norm=0.8,
+        normalization="vecnormalize",
+        truncation_as_termination=False,
+    ),
+    seeds=Seeds(train=[1, 0]),
+    collect=Collect(collector="population"),
+    store=EVERYTHING,
+)
+BARE = replace(TUNED, ppo=replace(TUNED.ppo, normalization="none", activation="tanh"))
+BOOTSTRAPPED = replace(TUNED, ppo=replace(TUNED.ppo, normalization="gymnasium"))
 
 
 def of_seed(dataset: wt.Dataset, seed: int) -> wt.Run:
@@ -59,15 +89,22 @@ def distance(weights: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 # Fidelity: the run of a seed is SB3's
 
 
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[wt.Run, wt.Run]:
+@pytest.fixture(
+    scope="module",
+    params=[PENDULUM, TUNED, BARE, BOOTSTRAPPED],
+    ids=["cleanrl", "tuned", "bare", "bootstrapped"],
+)
+def pair(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[wt.Run, wt.Run]:
     """The same seed trained in a population and by SB3."""
+    recipe: Recipe = request.param
     folder = tmp_path_factory.mktemp("pair")
     torch.set_num_threads(1)
-    ours = of_seed(collect(PENDULUM, folder / "ours"), 1)
+    ours = of_seed(collect(recipe, folder / "ours"), 1)
     options: dict[str, Any] = {n: v for n, v in vars(EVERYTHING).items() if n != "profile"}
     callback = WeightTrajectoryCallback(folder / "seed0001.zarr", **options)
-    config = PENDULUM.ppo
+    config = recipe.ppo
     make_ppo(config, seed=1).learn(config.total_timesteps, callback=callback)
     return ours, wt.open_run(folder / "seed0001.zarr")
 
@@ -107,7 +144,7 @@ def test_the_record_says_who_collected(pair: tuple[wt.Run, wt.Run]) -> None:
     for name in ("layout", "policy", "env", "seed", "cadence", "obs_norm", "diagnostics"):
         assert getattr(ours.info, name) == getattr(theirs.info, name), name
     assert wt.verify(ours.path) == []
-    observation = np.array([0.1, 0.02, -0.3, 0.4])
+    observation = np.linspace(-0.3, 0.4, *ours.info.policy.observation_shape)
     mine, other = (run.load_policy().predict(observation, deterministic=True) for run in pair)
     np.testing.assert_allclose(mine[0], other[0], rtol=1e-4, atol=1e-6)
 
@@ -142,11 +179,18 @@ def parameters_of(model: Any) -> np.ndarray:
     return torch.cat([p.detach().reshape(-1) for p in model.policy.parameters()]).numpy()
 
 
-@pytest.mark.parametrize(("plain", "ent_coef"), [(False, 0.0), (True, 0.01)])
-def test_updates_are_those_of_sb3_from_the_same_rollouts(plain: bool, ent_coef: float) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"clip_range_vf": None, "normalize_advantage": False, "ent_coef": 0.01},
+        {"activation": "relu", "ortho_init": False, "log_std_init": -2.0, "batch_size": 32},
+    ],
+    ids=["cleanrl", "plain", "relu"],
+)
+def test_updates_are_those_of_sb3_from_the_same_rollouts(options: dict[str, Any]) -> None:
     """HalfCheetah's own rollouts cannot be compared: it is chaotic, SB3 against SB3 too."""
-    options: dict[str, Any] = {"clip_range_vf": None, "normalize_advantage": False} if plain else {}
-    config = replace(CHEETAH, n_epochs=5, ent_coef=ent_coef, **options)
+    config = replace(CHEETAH, n_epochs=5, **options)
     callback = Rollouts()
     make_ppo(config, seed=4).learn(config.total_timesteps, callback=callback)
     origins = origins_of(config, [4, 5])
@@ -167,27 +211,68 @@ def test_updates_are_those_of_sb3_from_the_same_rollouts(plain: bool, ent_coef: 
     assert max(distance(np.stack(weights), np.stack(callback.weights))) < 1e-4
 
 
-@pytest.mark.parametrize("env_id", ["InvertedPendulum-v4", "HalfCheetah-v4", "Hopper-v5"])
-def test_environments_are_bit_by_bit_those_of_sb3(env_id: str) -> None:
-    config, seeds = PPOConfig(env_id=env_id), [3, 8]
+@pytest.mark.parametrize(
+    ("env_id", "normalization", "truncation_as_termination"),
+    [
+        ("InvertedPendulum-v4", "gymnasium", True),
+        ("HalfCheetah-v4", "gymnasium", True),
+        ("Hopper-v5", "gymnasium", True),
+        ("HalfCheetah-v4", "gymnasium", False),
+        ("HalfCheetah-v4", "vecnormalize", False),
+        ("Walker2d-v4", "vecnormalize", False),
+        ("Reacher-v4", "vecnormalize", True),
+        ("Hopper-v4", "none", False),
+        ("Reacher-v4", "none", True),
+    ],
+)
+def test_environments_are_bit_by_bit_those_of_sb3(
+    env_id: str, normalization: Any, truncation_as_termination: bool
+) -> None:
+    config = PPOConfig(
+        env_id=env_id,
+        normalization=normalization,
+        truncation_as_termination=truncation_as_termination,
+        gamma=0.98,
+    )
+    seeds = [3, 8]
     ours = Environments(config, seeds)
     theirs = [make_vec_env(config) for _ in seeds]
     for env, seed in zip(theirs, seeds, strict=True):
         env.seed(seed)
-    assert np.array_equal(ours.inputs, np.concatenate([env.reset() for env in theirs]))
-    rng, returns = np.random.default_rng(0), [[], []]  # type: ignore[var-annotated]
+    first = np.concatenate([env.reset() for env in theirs]).astype(np.float32)
+    assert np.array_equal(ours.inputs, first)
+    rng, truncated = np.random.default_rng(0), 0
+    returns: list[list[Any]] = [[], []]
     for _ in range(1100):  # past the time limit
         actions = rng.normal(size=(2, *ours.action_space.shape)).astype(np.float32) * 1.5
         clipped = np.clip(actions, ours.action_space.low, ours.action_space.high)
         steps = [env.step(clipped[[i]]) for i, env in enumerate(theirs)]
         rewards = ours.step(actions).astype(np.float32)
-        assert np.array_equal(ours.inputs, np.concatenate([step[0] for step in steps]))
+        inputs = np.concatenate([step[0] for step in steps]).astype(np.float32)
+        assert np.array_equal(ours.inputs, inputs)
         assert np.array_equal(rewards, np.concatenate([step[1] for step in steps]))
         assert np.array_equal(ours.starting, np.concatenate([step[2] for step in steps]))
         for i, (_, _, _, infos) in enumerate(steps):
             returns[i] += [infos[0]["episode"]["r"]] if "episode" in infos[0] else []
+            if "terminal_observation" in infos[0]:
+                last = infos[0]["terminal_observation"].astype(np.float32)
+                assert np.array_equal(ours.last_inputs()[i], last)
+                cut = infos[0]["TimeLimit.truncated"]
+                assert ours.truncated[i] == cut or truncation_as_termination
+                truncated += cut
     assert [list(some) for some in ours.returns] == [some[-100:] for some in returns]
     assert all(returns)
+    if env_id in ("HalfCheetah-v4", "Reacher-v4"):
+        assert bool(truncated) != truncation_as_termination
+    for i, env in enumerate(theirs):
+        norm = find_normalizers(env)
+        for read, mine in (
+            (norm.read_obs, ours.normalizer.obs_norm(i)),
+            (norm.read_ret, ours.normalizer.ret_norm(i)),
+        ):
+            assert (read is None) == (mine is None) == (normalization == "none")
+            if read is not None and mine is not None:
+                assert all(np.array_equal(x, y) for x, y in zip(read(), mine, strict=True))
     ours.close()
 
 
@@ -240,37 +325,44 @@ class Diary:
     end_training = end_update
 
 
-def diaries(seeds: list[int]) -> dict[int, list[np.ndarray]]:
-    learning = Population(CHEETAH, origins_of(CHEETAH, seeds))
+def diaries(config: PPOConfig, seeds: list[int]) -> dict[int, list[np.ndarray]]:
+    learning = Population(config, origins_of(config, seeds))
     watchers = [Diary(learning, i) for i in range(len(seeds))]
     learning.train(watchers)
     learning.close()
     return {seed: watcher.pages for seed, watcher in zip(seeds, watchers, strict=True)}
 
 
+@pytest.fixture(scope="module", params=[CHEETAH, TUNED.ppo], ids=["cleanrl", "tuned"])
+def config(request: pytest.FixtureRequest) -> PPOConfig:
+    settings: PPOConfig = request.param
+    return settings
+
+
 @pytest.fixture(scope="module")
-def cheetahs() -> dict[int, list[np.ndarray]]:
+def three(config: PPOConfig) -> dict[int, list[np.ndarray]]:
     torch.set_num_threads(1)
-    return diaries([0, 1, 2])
+    return diaries(config, [0, 1, 2])
 
 
 @pytest.mark.parametrize("seeds", [[0], [2, 0], [5, 4, 3, 2, 1, 0]])
 @pytest.mark.parametrize("group", [2**20, 1])
 def test_a_run_does_not_depend_on_its_company(
-    cheetahs: dict[int, list[np.ndarray]],
+    config: PPOConfig,
+    three: dict[int, list[np.ndarray]],
     seeds: list[int],
     group: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Nor on how many are updated together."""
     monkeypatch.setattr(population, "_GROUP", group)
-    for seed, pages in diaries(seeds).items():
-        if seed in cheetahs:
-            assert len(pages) == 3 * (2 + 4 * 8 + 7)
-            pairs = zip(pages, cheetahs[seed], strict=True)
+    for seed, pages in diaries(config, seeds).items():
+        if seed in three:
+            assert len(pages) == 3 * (2 + 4 * config.gradient_steps_per_iteration + 7)
+            pairs = zip(pages, three[seed], strict=True)
             assert all(np.array_equal(page, same) for page, same in pairs)
 
 
-def test_different_seeds_are_different_runs(cheetahs: dict[int, list[np.ndarray]]) -> None:
-    pairs = zip(cheetahs[0], cheetahs[1], strict=True)
+def test_different_seeds_are_different_runs(three: dict[int, list[np.ndarray]]) -> None:
+    pairs = zip(three[0], three[1], strict=True)
     assert not any(np.array_equal(page, other) for page, other in pairs if page.size > 1)

@@ -28,6 +28,7 @@ from weighttraj.collect.recipe import Collect, Seeds
 from weighttraj.errors import CollectError, RecipeError
 from weighttraj.format import DatasetInfo, RunEntry
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.format.integrity import seal
 
 QUICK = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1]), collect=Collect(collector="population"))
 
@@ -199,15 +200,24 @@ def test_a_data_set_keeps_its_collector(quick: Path) -> None:
     assert len(collect(smaller, quick)) == 2
 
 
-def test_a_data_set_from_before_there_were_populations_is_sb3s(
+def test_a_data_set_that_is_older_than_a_setting_has_its_default(
     small_dataset: Path, tmp_path: Path
 ) -> None:
     info = read_dataset_info(small_dataset)
-    old = {name: value for name, value in info.recipe.items() if name != "collect"}
+    young = ("activation", "ortho_init", "log_std_init")
+    ppo = {name: value for name, value in info.recipe["ppo"].items() if name not in young}
+    old = {**{n: v for n, v in info.recipe.items() if n != "collect"}, "ppo": ppo}
     out = tmp_path / "dataset"
     shutil.copytree(small_dataset, out)
     write_dataset_info(out, replace(info, recipe=old))
+    seal(out)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     assert len(collect(SMALL_RECIPE, out)) == 4
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert replay(out, 3) == []
+    relu = replace(SMALL_RECIPE, ppo=replace(SMALL_RECIPE.ppo, activation="relu"))
+    with pytest.raises(CollectError, match=r"(?s)another recipe.*'ppo.activation': 'tanh'.*'relu'"):
+        collect(relu, out)
 
 
 # What a population cannot do
@@ -224,8 +234,6 @@ class Scaled(gym.Wrapper[Any, Any, Any, Any]):
         ({"env_id": "Pendulum-v1"}, "batched physics"),
         ({"env_id": "Humanoid-v5"}, "batched physics"),
         ({"env_id": "WrappedPendulum-v0"}, "batched physics"),
-        ({"normalization": "vecnormalize"}, "'normalization': 'vecnormalize'"),
-        ({"truncation_as_termination": False}, "'truncation_as_termination': False"),
         ({"batch_size": 24, "n_steps": 72}, "'batch_size': 24"),
         ({"batch_size": 48}, "'n_steps': 64"),
     ],

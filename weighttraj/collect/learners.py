@@ -59,8 +59,8 @@ class Learners:
     ) -> None:
         self._config = config
         self._stack = stack
-        self._actor = MLP(stack, actor, config.batch_size)
-        self._critic = MLP(stack, critic, config.batch_size)
+        self._actor = MLP(stack, actor, config.batch_size, config.activation)
+        self._critic = MLP(stack, critic, config.batch_size, config.activation)
         self._log_std = stack.value("log_std")
         self._log_std_gradient = stack.gradient("log_std")
         parameter = torch.nn.Parameter(stack.values)

@@ -7,7 +7,7 @@ where a layer has a single unit) than a stack of several. So a stack has at leas
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +86,7 @@ class _Layer:
 
 
 class MLP:
-    """A tanh network of each learner of a stack, with buffers for one batch size.
+    """A network of each learner of a stack, with buffers for one batch size.
 
     The gradient is written out: with buffers that are kept, and products that write into the stack,
     it takes two thirds of the time of autograd, which allocates each intermediate anew.
@@ -95,9 +95,10 @@ class MLP:
         stack: where the parameters are.
         layers: prefixes of the parameters' names, from the first layer to the last.
         batch: samples that each learner takes at once.
+        activation: function between the layers, ``tanh`` or ``relu``.
     """
 
-    def __init__(self, stack: Stack, layers: Sequence[str], batch: int) -> None:
+    def __init__(self, stack: Stack, layers: Sequence[str], batch: int, activation: str) -> None:
         def make(prefix: str) -> _Layer:
             weight, bias = f"{prefix}.weight", f"{prefix}.bias"
             shape = (len(stack), batch, stack.shapes[bias][0])
@@ -111,6 +112,7 @@ class MLP:
             )
 
         self._layers = [make(prefix) for prefix in layers]
+        self._activate, self._activation_gradient = _ACTIVATIONS[activation]
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Outputs (learner, sample, out), in a buffer that the next call writes again.
@@ -122,7 +124,7 @@ class MLP:
             torch.baddbmm(layer.bias, inputs, layer.weight.mT, out=layer.output)
             inputs = layer.output
             if layer is not self._layers[-1]:
-                inputs.tanh_()
+                self._activate(inputs)
         return inputs
 
     def backward(self, inputs: Tensor, gradient: Tensor) -> None:
@@ -136,8 +138,25 @@ class MLP:
             _layer_gradient(layer, below.output, gradient)
             torch.bmm(gradient, layer.weight, out=below.output_gradient)
             gradient = below.output_gradient
-            torch.ops.aten.tanh_backward.grad_input(gradient, below.output, grad_input=gradient)
+            self._activation_gradient(gradient, below.output)
         _layer_gradient(self._layers[0], inputs, gradient)
+
+
+def _tanh_gradient(gradient: Tensor, output: Tensor) -> None:
+    """Turn the gradient by tanh's output into that by its input, in place."""
+    torch.ops.aten.tanh_backward.grad_input(gradient, output, grad_input=gradient)
+
+
+def _relu_gradient(gradient: Tensor, output: Tensor) -> None:
+    """Turn the gradient by ReLU's output into that by its input, in place."""
+    torch.ops.aten.threshold_backward.grad_input(gradient, output, 0, grad_input=gradient)
+
+
+_ACTIVATIONS: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor, Tensor], None]]] = {
+    "tanh": (torch.tanh_, _tanh_gradient),
+    "relu": (torch.relu_, _relu_gradient),
+}
+"""Each activation in place, and what it does to a gradient."""
 
 
 def _layer_gradient(layer: _Layer, inputs: Tensor, gradient: Tensor) -> None:

@@ -97,7 +97,7 @@ class Population:
         actor, critic = list(actor_parameters(policy)), list(critic_parameters(policy))
         self._actor, self._critic = self.stack.places(actor), self.stack.places(critic)
         layers = _layers(actor), _layers(critic)
-        self._act, self._judge = (MLP(self.stack, names, 1) for names in layers)
+        self._act, self._judge = (MLP(self.stack, names, 1, config.activation) for names in layers)
         groups = _groups(*self.stack.values.shape)
         self.groups = [(part, Learners(config, self.stack[part], *layers)) for part in groups]
         """Learners that are updated together."""
@@ -119,8 +119,8 @@ class Population:
             "weights": row[actor],
             "num_timesteps": self.num_timesteps,
             "learning_rate": self._learning_rate,
-            "obs_norm": self._environments.observations.of(learner),
-            "ret_norm": self._environments.rewards.of(learner),
+            "obs_norm": self._environments.normalizer.obs_norm(learner),
+            "ret_norm": self._environments.normalizer.ret_norm(learner),
             "critic": row[self._critic] if critic else None,
             "moments": self._moments(learner) if moments else None,
         }
@@ -179,11 +179,13 @@ class Population:
             means[t] = self._act.forward(torch.from_numpy(inputs)[:, None])[:, 0].numpy()
             buffer.actions[t] = actions = means[t] + noise[t] * std
             buffer.rewards[t] = environments.step(actions)
+            if not config.truncation_as_termination and environments.truncated.any():
+                self._bootstrap(buffer.rewards[t])
         buffer.log_probs[:] = _log_probs(buffer.actions, means, std)
         observations = _by_learner(buffer.observations)
         for part, learners in self.groups:
             buffer.values[:, part] = learners.estimate(observations[part]).T.numpy()
-        last = self._judge.forward(torch.from_numpy(environments.inputs)[:, None])
+        last = self._judge_each(environments.inputs)
         buffer.compute_returns_and_advantage(last, environments.starting)
         return Rollout(
             observations=observations,
@@ -193,6 +195,16 @@ class Population:
             advantages=_by_learner(buffer.advantages),
             returns=_by_learner(buffer.returns),
         )
+
+    def _bootstrap(self, rewards: np.ndarray) -> None:
+        """Add the value of what would have come to rewards at the time limit, as SB3 does."""
+        values = self._judge_each(self._environments.last_inputs())[:, 0, 0].numpy()
+        cut = self._environments.truncated
+        rewards[cut] += np.float32(self._config.gamma) * values[cut]
+
+    def _judge_each(self, inputs: np.ndarray) -> Tensor:
+        """The critic's values (learner, 1, 1) of one input each, (learner, obs)."""
+        return self._judge.forward(torch.from_numpy(inputs)[:, None])
 
     def _draw_noise(self) -> np.ndarray:
         """Standard normal numbers as SB3's distribution draws them, (step, learner, action)."""
@@ -236,16 +248,13 @@ def check_config(config: PPOConfig) -> None:
         CollectError: it cannot, or the environment is unknown.
     """
     wrong = {
-        "normalization": config.normalization != "gymnasium",
-        "truncation_as_termination": not config.truncation_as_termination,
         "n_steps": config.n_steps % config.batch_size != 0,
         "batch_size": config.batch_size % 16 != 0,
     }
     if any(wrong.values()):
         raise CollectError(
             "a population cannot train with these settings",
-            expected='normalization = "gymnasium", truncation_as_termination = true, n_steps a '
-            "multiple of batch_size, and that a multiple of 16",
+            expected="n_steps a multiple of batch_size, and that a multiple of 16",
             got={name: getattr(config, name) for name, is_wrong in wrong.items() if is_wrong},
             do='change them, or set collector = "sb3" in [collect]',
         )

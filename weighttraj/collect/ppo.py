@@ -32,6 +32,9 @@ from weighttraj import environments
 from weighttraj.collect.wrappers import ClipObservation, TruncationAsTermination
 from weighttraj.errors import CollectError
 
+ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}
+"""Modules of the activation functions that a recipe can name."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig:
@@ -45,6 +48,12 @@ class PPOConfig:
     """Units of the policy's hidden layers."""
     critic_arch: tuple[int, ...] | None = None
     """Units of the critic's hidden layers; None: the policy's, at least 64 each."""
+    activation: Literal["tanh", "relu"] = "tanh"
+    """Function between the layers of both networks."""
+    ortho_init: bool = True
+    """Begin with orthogonal weights; False: with torch's default for linear layers."""
+    log_std_init: float = 0.0
+    """Logarithm of the actions' standard deviation before training."""
     learning_rate: float = 3e-4
     """Of the first iteration."""
     anneal_learning_rate: bool = True
@@ -62,7 +71,7 @@ class PPOConfig:
     clip_range: float = 0.2
     """Clip of the probability ratio."""
     clip_range_vf: float | None = 0.2
-    """Clip of the value's change; None: not clipped."""
+    """Clip of the value's change; None (in a recipe ``false``): not clipped."""
     normalize_advantage: bool = True
     """Standardise advantages in each minibatch."""
     ent_coef: float = 0.0
@@ -155,9 +164,9 @@ def make_ppo(config: PPOConfig, *, seed: int) -> PPO:
         seed=seed,
         policy_kwargs={
             "net_arch": {"pi": list(config.net_arch), "vf": list(critic)},
-            "activation_fn": torch.nn.Tanh,
-            "ortho_init": True,
-            "log_std_init": 0.0,
+            "activation_fn": ACTIVATIONS[config.activation],
+            "ortho_init": config.ortho_init,
+            "log_std_init": config.log_std_init,
             "optimizer_kwargs": {"eps": config.adam_eps},
         },
     )

@@ -168,6 +168,9 @@ def read_recipe(path: str | Path) -> Recipe:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError("the recipe is no TOML", got=error, where=path) from error
     _check_keys(document, Recipe, str(path))
+    ppo = document.get("ppo")
+    if isinstance(ppo, dict) and ppo.get("clip_range_vf") is False:
+        ppo["clip_range_vf"] = None  # TOML has no null
     try:
         recipe = msgspec.convert(document, Recipe)
     except msgspec.ValidationError as error:

@@ -12,12 +12,11 @@ from gymnasium import spaces
 
 from weighttraj import environments
 from weighttraj.collect.ppo import PPOConfig
-from weighttraj.collect.statistics import ObservationStatistics, RewardStatistics
+from weighttraj.collect.statistics import NORMALIZERS
 from weighttraj.errors import CollectError
 from weighttraj.policies.kernels import Kernel, kernel_for
 from weighttraj.policies.simulators import Physics, start_of
 
-_BOUND = 10.0
 _EPISODES = 100
 """Episodes whose mean return is reported, as SB3's ``stats_window_size``."""
 
@@ -29,7 +28,7 @@ class Environments:
     Gymnasium's; steps are batched physics, bit by bit Gymnasium's too.
 
     Args:
-        config: which environment, and the discount.
+        config: which environment, how it is normalised, and the discount.
         seeds: of the first reset, one a learner.
 
     Raises:
@@ -44,16 +43,21 @@ class Environments:
         self._everyone = np.arange(len(seeds))
         self.action_space = cast(spaces.Box, self._envs[0].action_space)
         first = self._reset(self._everyone, seeds)
-        self.observations = ObservationStatistics(first, _BOUND)
-        self.rewards = RewardStatistics(len(seeds), config.gamma, _BOUND)
-        self.inputs = self.observations.normalize(first, slice(None))
-        """What the agents see now, float32 (learner, obs)."""
+        self.normalizer = NORMALIZERS[config.normalization](first, config.gamma)
+        """Statistics, and what the agents see now."""
         self.starting = np.ones(len(seeds), bool)
         """Whether that is the first observation of an episode, (learner,)."""
-        self.returns: list[deque[float]] = [deque(maxlen=_EPISODES) for _ in seeds]
+        self.truncated = np.zeros(len(seeds), bool)
+        """Whether the episode before was cut off at the time limit, and not terminated."""
+        self.returns: list[deque[Any]] = [deque(maxlen=_EPISODES) for _ in seeds]
         """Returns of each learner's last episodes."""
-        self._return = np.zeros(len(seeds))
+        self._return = np.zeros(len(seeds), self.normalizer.returns_dtype)
         self._length = np.zeros(len(seeds), np.int64)
+
+    @property
+    def inputs(self) -> np.ndarray:
+        """What the agents see now, float32 (learner, obs)."""
+        return self.normalizer.inputs
 
     def step(self, actions: np.ndarray) -> np.ndarray:
         """Step every environment; those that end begin anew.
@@ -62,33 +66,37 @@ class Environments:
             actions: float32 (learner, action); clipped here, as SB3 clips them.
 
         Returns:
-            Scaled rewards, float64 (learner,).
+            Scaled rewards, (learner,).
         """
         actions = np.clip(actions, self.action_space.low, self.action_space.high)
         # As under Gymnasium, a simulation that breaks down goes on from MuJoCo's own reset.
         step = self._physics.step(self._everyone, actions)
-        self._return += step.rewards
+        self._return += step.rewards.astype(self._return.dtype, copy=False)
         self._length += 1
         self.starting = step.terminated | (self._length >= self._limit)
-        self.observations.update(step.observations, slice(None))
-        self.inputs = self.observations.normalize(step.observations, slice(None))
-        rewards = self.rewards.scale(step.rewards, step.terminated)
-        if self.starting.any():
-            self._restart(np.flatnonzero(self.starting))
-        return rewards
+        self.truncated = self.starting & ~step.terminated
+        ended = np.flatnonzero(self.starting)
+        first = self._restart(ended) if len(ended) else step.observations[:0]
+        self.normalizer.observe(step.observations, ended, first)
+        return self.normalizer.scale(step.rewards, step.terminated, self.starting)
+
+    def last_inputs(self) -> np.ndarray:
+        """What the agents would see now if no episode had ended, float32 (learner, obs)."""
+        inputs = self.normalizer.inputs.copy()
+        inputs[self.starting] = self.normalizer.last_inputs
+        return inputs
 
     def close(self) -> None:
         """Close the environments."""
         for env in self._envs:
             env.close()
 
-    def _restart(self, learners: np.ndarray) -> None:
+    def _restart(self, learners: np.ndarray) -> np.ndarray:
+        """Begin the next episode of some learners; observations, float64 (learner, obs)."""
         for learner in learners:
-            self.returns[learner].append(float(self._return[learner]))
+            self.returns[learner].append(self._return[learner])
         self._return[learners], self._length[learners] = 0, 0
-        first = self._reset(learners, [None] * len(learners))
-        self.observations.update(first, learners)
-        self.inputs[learners] = self.observations.normalize(first, learners)
+        return self._reset(learners, [None] * len(learners))
 
     def _reset(self, learners: np.ndarray, seeds: Sequence[int | None]) -> np.ndarray:
         """Reset the environments of some learners; observations, float64 (learner, obs)."""

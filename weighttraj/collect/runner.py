@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 
 from weighttraj.collect.costs import measured
 from weighttraj.collect.population import check_config
-from weighttraj.collect.recipe import Collect, Recipe
+from weighttraj.collect.recipe import Recipe
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
 from weighttraj.engine import Engine, engine_of
 from weighttraj.errors import CollectError, RecipeError, ReplayError, WeightTrajError
@@ -105,11 +105,11 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
     )
     if (out / "dataset.json").exists():
         old = read_dataset_info(out)
-        # Neither changes what a run is; and data sets that are older than [collect] are SB3's.
-        default, ignored = _flat({"collect": asdict(Collect())}), {"collect.population": None}
-        both = ({**recipe, "seeds": None} for recipe in (old.recipe, document))
-        before, now = (default | _flat(recipe) | ignored for recipe in both)
-        other = sorted(k for k in before | now if before.get(k) != now.get(k))
+        # Keys that are younger than the data set were at what is today their default.
+        default = _flat(json.loads(json.dumps(asdict(Recipe(id="")))))
+        before, now = (default | _flat(recipe) for recipe in (old.recipe, document))
+        changed = sorted(k for k in before | now if before.get(k) != now.get(k))
+        other = [k for k in changed if not k.startswith("seeds.") and k != "collect.population"]
         if other:
             raise CollectError(
                 "the folder holds a data set of another recipe",
@@ -118,7 +118,7 @@ def _prepare(recipe: Recipe, out: Path, seeds: list[int] | None) -> DatasetInfo:
                 where=out,
                 do="choose another folder with --out",
             )
-        info = replace(old, recipe=document)
+        info = replace(old, recipe=document) if changed else old
     elif out.exists() and any(not path.name.startswith(".") for path in out.iterdir()):
         raise CollectError(
             "the folder is not empty and holds no data set",
