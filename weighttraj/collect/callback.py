@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from pathlib import Path
 
@@ -20,8 +21,8 @@ from weighttraj.collect.describe import (
 )
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.recorder import Reading, Recorder
-from weighttraj.errors import CollectError
-from weighttraj.format import RunWriter
+from weighttraj.errors import CollectError, PolicyError
+from weighttraj.format import RunInfo, RunWriter
 from weighttraj.format.schema import Status
 
 
@@ -137,6 +138,7 @@ class WeightTrajectoryCallback(BaseCallback):
             probe_observations=self.probe_observations,
             block=self.block,
         )
+        _warn_if_lost(info, self.path)
         steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
         self._recorder = Recorder(
             self.path,
@@ -203,6 +205,19 @@ class WeightTrajectoryCallback(BaseCallback):
             return _flat([s.get(name, torch.zeros_like(p)).detach() for p, s in states])
 
         return read("exp_avg"), read("exp_avg_sq")
+
+
+def _warn_if_lost(info: RunInfo, path: Path) -> None:
+    """Tell the trainer, before the training begins, that the run's policies cannot be rebuilt."""
+    if info.policy.cannot_rebuild:
+        text = PolicyError(
+            "the weights of this training are recorded, but run.load_policy(t) cannot rebuild "
+            "its policies from them",
+            got="; ".join(info.policy.cannot_rebuild),
+            where=path,
+            do="load snapshots into a model of your own with run.load_into(model, t)",
+        )
+        warnings.warn(text.message, UserWarning, stacklevel=2)
 
 
 def _flat(tensors: list[torch.Tensor]) -> np.ndarray:
