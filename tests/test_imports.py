@@ -31,7 +31,8 @@ ALLOWED = {
         "weighttraj.remote",
         "later weighttraj.remote.hub",
     ],
-    "weighttraj.format.layout": ["weighttraj.errors"],
+    "weighttraj.format.values": ["weighttraj.errors"],
+    "weighttraj.format.layout": ["weighttraj.errors", "weighttraj.format.values"],
     "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
     "weighttraj.format.objects": ["weighttraj.errors", "weighttraj.remote.address"],
     "weighttraj.format.remote": [
@@ -81,6 +82,7 @@ ALLOWED = {
         "weighttraj.format.live",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
+        "weighttraj.format.values",
     ],
     "weighttraj.format.returns": [
         "weighttraj.errors",
@@ -114,7 +116,6 @@ ALLOWED = {
         "weighttraj.format.schema",
         "weighttraj.format.storage",
         REMOTE,
-        "later weighttraj.collect.into",
         "later weighttraj.format.hdf5",
         "later weighttraj.load.windows",
         "later weighttraj.policies.policy",
@@ -146,7 +147,6 @@ ALLOWED = {
         FORMAT,
         "weighttraj.collect",
         "weighttraj.policies.kernels",
-        "weighttraj.policies.policy",
         "weighttraj.policies.simulators",
     ],
     "weighttraj.learning": [],

@@ -500,7 +500,13 @@ def _cache(
 def _state_of(path: Path) -> str:
     """What remains to be said of something whole: it may not be finished."""
     if not (path / "dataset.json").is_file():
-        return ""
+        info = wt.open_run(path).info
+        if info.status == "complete":
+            return ""
+        return (
+            f" so far; {info.n_committed} snapshots are committed, and the run is not finished "
+            f"({info.status})"
+        )
     dataset = wt.open(path)
     if dataset.info.status == "complete":
         return ""

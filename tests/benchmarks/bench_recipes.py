@@ -29,7 +29,7 @@ from results import save
 
 import weighttraj as wt
 from weighttraj.collect import Recipe, collect, read_recipe
-from weighttraj.collect.describe import actor_parameters
+from weighttraj.collect.agents import actor_parameters
 from weighttraj.collect.population import Origin
 from weighttraj.collect.rollouts import Environments
 

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import warnings
 import weakref
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch import nn
 
-from weighttraj.collect.describe import (
-    DIAGNOSTICS,
-    actor_parameters,
-    check_model,
-    critic_parameters,
-    describe_run,
-)
+from weighttraj.collect.agents import Agent, Unit, find_agent
+from weighttraj.collect.describe import describe_run, diagnostics_of
+from weighttraj.collect.guard import Guard
 from weighttraj.collect.normalizers import find_normalizers
-from weighttraj.collect.recorder import Reading, Recorder
-from weighttraj.errors import CollectError, PolicyError
-from weighttraj.format import RunInfo, RunWriter
+from weighttraj.collect.origin import find_origin, find_source
+from weighttraj.collect.recorder import Counters, Reading, Recorder
+from weighttraj.collect.watch import Watch
+from weighttraj.errors import CollectError
+from weighttraj.format import Run, RunInfo, RunWriter
 from weighttraj.format.schema import Status
+
+_WATCHED_STEPS = 64
+"""First gradient steps before which the weights of off-policy algorithms are compared; those of
+others are compared before each step of the first update."""
 
 
 class WeightTrajectoryCallback(BaseCallback):
@@ -34,34 +37,52 @@ class WeightTrajectoryCallback(BaseCallback):
     this callback. Each row of the store holds only what was known when its snapshot was taken:
     an update's diagnostics stand beside the snapshot of its end, NaN beside the others.
 
+    It records algorithms whose optimizer steps the policy: PPO, A2C, MaskablePPO and RecurrentPPO,
+    whose snapshots have an iteration and a phase; and SAC, TD3, DDPG, DQN, TQC, CrossQ and QR-DQN,
+    which have none. There the parameters are those of the actor or the Q-network, and the steps
+    those of its optimizer: with TD3's ``policy_delay`` of 2, one for two steps of the critic. It
+    is checked that the weights change by the counted steps only. Algorithms that move their policy
+    in another way, such as TRPO, are recorded with ``unit="update"``.
+
     Args:
         path: folder of the run to be written, ``<data set>/runs/<run id>.zarr``.
-        every: gradient steps from one snapshot to the next. PPO's default update (2048 samples,
-            10 epochs, minibatches of 64) has 320 gradient steps: 64 gives 5 snapshots an update.
+        every: gradient steps (or updates) from one snapshot to the next. PPO's default update (2048
+            samples, 10 epochs, minibatches of 64) has 320 gradient steps: 64, the default, gives 5
+            snapshots an update. The default for ``unit="update"`` is 1.
+        unit: what is counted: ``"gradient_step"``, the optimizer's steps, or ``"update"``, all that
+            changes the weights between two rollouts.
         run_id: id of the run; default: the path's name.
+        continues: run that the training goes on from, or its path. The model's weights must be
+            one of its snapshots: the new run says which, and its counters go on from there.
         critic: store the critic's parameters too.
         optimizer_moments: store Adam's moments of the policy's parameters too.
-        probe_observations: network inputs kept of each rollout, evenly spaced; 0: none.
+        probe_observations: network inputs kept of each rollout, evenly spaced; 0: none. Off-policy
+            algorithms have no rollouts, and none are kept.
         block: snapshots in a chunk and in a commit; a killed process loses at most one block.
         resume: continue an interrupted run by repeating it: see ``RunWriter``.
         verbose: SB3's verbosity.
 
     Raises:
-        CollectError: (when training starts) several optimizers or normalisers.
+        CollectError: (when training starts, before anything is written) no single optimizer steps
+            the policy; several normalisers; the model is no snapshot of the run that it continues.
+            (after the first update, and nothing is kept; or later) the weights change outside the
+            counted steps.
         StoreExistsError: (when training starts) the path exists.
         SnapshotError: (while training) the weights are not finite.
 
-    SB3 tells callbacks nothing when training ends by an exception. Used as a context manager around
-    ``learn``, the callback then commits the last snapshots and marks the run ``crashed``; otherwise
-    the block that was being filled is lost, as if the process had been killed.
+    An exception that ends ``learn``, such as Ctrl-C, is noticed: what was recorded is committed
+    and the run is marked ``crashed``. A callback records one call of ``learn``. A second call,
+    with ``reset_num_timesteps=False``, gets a callback of its own that ``continues`` the first run.
     """
 
     def __init__(
         self,
         path: str | Path,
         *,
-        every: int = 64,
+        every: int | None = None,
+        unit: Unit | str = "gradient_step",
         run_id: str | None = None,
+        continues: Run | str | Path | None = None,
         critic: bool = False,
         optimizer_moments: bool = False,
         probe_observations: int = 64,
@@ -70,6 +91,15 @@ class WeightTrajectoryCallback(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        if unit not in get_args(Unit):
+            raise CollectError(
+                "an unknown unit of steps",
+                expected=" or ".join(map(repr, get_args(Unit))),
+                got=repr(unit),
+                do="choose what is counted",
+            )
+        if every is None:
+            every = 64 if unit == "gradient_step" else 1
         if every < 1:
             raise CollectError(
                 "snapshots need at least one gradient step between them",
@@ -78,14 +108,20 @@ class WeightTrajectoryCallback(BaseCallback):
             )
         self.path = Path(path)
         self.every = every
+        self.unit: Unit = "update" if unit == "update" else "gradient_step"
         self.run_id = run_id or self.path.name.removesuffix(".zarr")
+        self.continues = continues
         self.critic = critic
         self.optimizer_moments = optimizer_moments
         self.probe_observations = probe_observations
         self.block = block
         self.resume = resume
-        self._algorithm: OnPolicyAlgorithm
+        self._agent: Agent
+        self._watch: Watch
         self._recorder: Recorder | None = None
+        self._undo: list[Callable[[], None]] = []
+        self._steps = 0
+        self._trusted = False
 
     @property
     def writer(self) -> RunWriter:
@@ -99,7 +135,7 @@ class WeightTrajectoryCallback(BaseCallback):
     def close(self, status: Status = "crashed") -> None:
         """Commit what is left and stop recording. Does nothing after training has ended well."""
         if self._recorder is not None:
-            self._hook.remove()
+            self._let_go()
             self._recorder.close(status)
 
     def __enter__(self) -> WeightTrajectoryCallback:
@@ -109,27 +145,58 @@ class WeightTrajectoryCallback(BaseCallback):
         self.close()
 
     def _on_training_start(self) -> None:
-        self._algorithm = model = check_model(self.model)
         if self._recorder is not None:
             raise CollectError(
                 "a callback records one call of learn()",
                 got="a second call",
                 where=self.path,
-                do="make a new callback, with a new path, for the second call",
+                do="make a new callback for the second call, with a path of its own; where the "
+                "training goes on, with reset_num_timesteps=False, give it "
+                f"continues={str(self.path)!r}",
             )
-        self._norm = find_normalizers(model.get_env() or self.training_env)
-        if self.optimizer_moments and not isinstance(model.policy.optimizer, torch.optim.Adam):
+        self._agent = find_agent(self.model, self.unit)
+        self._norm = find_normalizers(self.model.get_env() or self.training_env)
+        self._check_options()
+        info, counters = self._describe()
+        steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
+        self._recorder = Recorder(
+            self.path,
+            info,
+            self._read,
+            every=self.every,
+            steps_per_epoch=steps // getattr(self.model, "n_epochs", 1) if steps else None,
+            rollouts=self._agent.has_rollouts,
+            start=counters,
+            resume=self.resume,
+        )
+        self._watch = Watch(self._agent)
+        self._hold_on()
+        # For notebooks. Not at exit: Zarr's threads are gone by then.
+        weakref.finalize(self, self._recorder.writer.close, "crashed").atexit = False
+
+    def _check_options(self) -> None:
+        """Raise CollectError if something is to be stored that the algorithm does not have."""
+        agent, name = self._agent, type(self.model).__name__
+        if self.optimizer_moments and not isinstance(agent.optimizer, torch.optim.Adam):
             raise CollectError(
                 "this optimizer has no moments to store",
                 expected="Adam or AdamW",
-                got=type(model.policy.optimizer).__name__,
-                where=type(model).__name__,
+                got=type(agent.optimizer).__name__ if agent.optimizer else f"unit={self.unit!r}",
+                where=name,
                 do="leave optimizer_moments out",
             )
-        self._actor = actor_parameters(model.policy)
-        self._critic = critic_parameters(model.policy)
+        if self.critic and not agent.critic:
+            raise CollectError(
+                "this algorithm has no critic apart from the network that acts",
+                expected="an actor and a critic, as in PPO or SAC",
+                got=name,
+                do="leave critic out",
+            )
+
+    def _describe(self) -> tuple[RunInfo, Counters]:
+        """Return the run's metadata and the counters that it starts with."""
         info = describe_run(
-            model,
+            self._agent,
             self._norm,
             run_id=self.run_id,
             every=self.every,
@@ -138,40 +205,86 @@ class WeightTrajectoryCallback(BaseCallback):
             probe_observations=self.probe_observations,
             block=self.block,
         )
-        _warn_if_lost(info, self.path)
-        steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
-        self._recorder = Recorder(
-            self.path,
-            info,
-            self._read,
-            every=self.every,
-            steps_per_epoch=steps // getattr(model, "n_epochs", 1) if steps else None,
-            resume=self.resume,
+        self._timesteps_before = 0
+        if self.continues is None:
+            return replace(info, continues=find_origin(self._agent)), Counters()
+        weights = _flat(list(self._agent.actor.values()))
+        origin, counters = find_source(
+            self.continues, self._agent, info.layout, weights, self._norm
         )
-        self._hook = model.policy.optimizer.register_step_post_hook(self._on_gradient_step)
-        # For notebooks. Not at exit: Zarr's threads are gone by then.
-        weakref.finalize(self, self._recorder.writer.close, "crashed").atexit = False
+        self._timesteps_before = origin.num_timesteps - self.model.num_timesteps
+        return replace(info, continues=origin), counters
+
+    def _hold_on(self) -> None:
+        """Follow the optimizer's steps, and notice when an exception ends the training."""
+        self._undo = [Guard(self.model, self.close).remove]
+        optimizer = self._agent.optimizer
+        if optimizer is not None:
+            self._undo += [
+                optimizer.register_step_pre_hook(self._on_step_begin).remove,
+                optimizer.register_step_post_hook(self._on_gradient_step).remove,
+            ]
+
+    def _let_go(self) -> None:
+        for undo in self._undo:
+            undo()
+        self._undo = []
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
+        self._end_update()
         self._recording.end_update(self._diagnostics())
 
     def _on_rollout_end(self) -> None:
-        returns = [episode["r"] for episode in self._algorithm.ep_info_buffer or ()]
+        returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
+        if not self._agent.has_rollouts:
+            self._recording.note_returns(returns)
+            return
+        self._check("during a rollout")
         inputs: np.ndarray = np.empty(0)
-        if self.writer.info.probe_observations:
-            inputs = np.asarray(self._algorithm.rollout_buffer.observations, np.float32)
+        if self.writer.info.probe_observations and self._agent.on_policy is not None:
+            inputs = np.asarray(self._agent.on_policy.rollout_buffer.observations, np.float32)
             inputs = inputs.reshape(-1, *self.writer.info.policy.observation_shape)
         self._recording.end_rollout(returns, inputs)
 
+    def _on_step_begin(self, *_: object) -> None:
+        if not self._trusted:  # later the borders of updates will do
+            self._check("between the optimizer's steps")
+
     def _on_gradient_step(self, *_: object) -> None:
+        self._watch.note()
+        self._steps += 1
         self._recording.end_gradient_step()
 
+    def _end_update(self) -> None:
+        """Count an update, or check that its steps were counted."""
+        if self.unit == "update":
+            if self._watch.has_moved():
+                self._on_gradient_step()
+        else:
+            self._check("at the end of an update")
+        if self._steps >= (1 if self._agent.has_rollouts else _WATCHED_STEPS):
+            self._trusted = True
+
+    def _check(self, when: str) -> None:
+        try:
+            self._watch.check(when)
+        except CollectError:
+            self._let_go()
+            if self._trusted:
+                self._recording.close("crashed")
+            else:
+                self._recording.discard()
+            raise
+
     def _on_training_end(self) -> None:
-        self._hook.remove()
-        self._recording.end_training(self._diagnostics())
+        try:
+            self._end_update()
+            self._recording.end_training(self._diagnostics())
+        finally:
+            self.close()
 
     @property
     def _recording(self) -> Recorder:
@@ -184,42 +297,33 @@ class WeightTrajectoryCallback(BaseCallback):
         return self._recorder
 
     def _read(self) -> Reading:
-        policy, norm = self._algorithm.policy, self._norm
+        agent, norm = self._agent, self._norm
         return {
-            "weights": _flat([p.detach() for p in self._actor.values()]),
-            "num_timesteps": self._algorithm.num_timesteps,
-            "learning_rate": policy.optimizer.param_groups[0]["lr"],
+            "weights": _flat(list(agent.actor.values())),
+            "num_timesteps": self.model.num_timesteps + self._timesteps_before,
+            "learning_rate": agent.learning_rate,
             "obs_norm": norm.read_obs() if norm.read_obs else None,
             "ret_norm": norm.read_ret() if norm.read_ret else None,
-            "critic": _flat([p.detach() for p in self._critic.values()]) if self.critic else None,
-            "moments": self._moments(policy.optimizer) if self.optimizer_moments else None,
+            "critic": _flat(list(agent.critic.values())) if self.critic else None,
+            "moments": self._moments() if self.optimizer_moments else None,
         }
 
     def _diagnostics(self) -> dict[str, float]:
-        logged, names = self.logger.name_to_value, DIAGNOSTICS.get(type(self.model).__name__, ())
+        logged, names = self.logger.name_to_value, diagnostics_of(self.model)
         return {name: float(logged.get(f"train/{name}", np.nan)) for name in names}
 
-    def _moments(self, optimizer: torch.optim.Optimizer) -> tuple[np.ndarray, np.ndarray]:
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+        state = self._agent.optimizer.state if self._agent.optimizer is not None else {}
+
         def read(name: str) -> np.ndarray:
-            states = [(p, optimizer.state.get(p, {})) for p in self._actor.values()]
-            return _flat([s.get(name, torch.zeros_like(p)).detach() for p, s in states])
+            parameters = self._agent.actor.values()
+            return _flat([state.get(p, {}).get(name, torch.zeros_like(p)) for p in parameters])
 
         return read("exp_avg"), read("exp_avg_sq")
 
 
-def _warn_if_lost(info: RunInfo, path: Path) -> None:
-    """Tell the trainer, before the training begins, that the run's policies cannot be rebuilt."""
-    if info.policy.cannot_rebuild:
-        text = PolicyError(
-            "the weights of this training are recorded, but run.load_policy(t) cannot rebuild "
-            "its policies from them",
-            got="; ".join(info.policy.cannot_rebuild),
-            where=path,
-            do="load snapshots into a model of your own with run.load_into(model, t)",
-        )
-        warnings.warn(text.message, UserWarning, stacklevel=2)
-
-
 def _flat(tensors: list[torch.Tensor]) -> np.ndarray:
     """A copy of the tensors as one float32 vector."""
-    return nn.utils.parameters_to_vector(tensors).to("cpu", torch.float32).numpy().copy()
+    detached = [tensor.detach() for tensor in tensors]
+    vector = nn.utils.parameters_to_vector(detached)
+    return vector.to("cpu", torch.float32).numpy().copy()

@@ -6,7 +6,6 @@ import importlib.metadata
 import platform
 import subprocess
 import sys
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,15 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
+from weighttraj.collect.agents import Agent
 from weighttraj.collect.normalizers import Normalizers
-from weighttraj.collect.proof import find_difference
-from weighttraj.errors import CollectError
 from weighttraj.format import (
     Algorithm,
     Cadence,
@@ -37,16 +35,27 @@ from weighttraj.format.layout import Role
 
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy", "zarr", "weighttraj")
 
+_PPO = (
+    "approx_kl",
+    "clip_fraction",
+    "entropy_loss",
+    "explained_variance",
+    "policy_gradient_loss",
+    "value_loss",
+)
+_SAC = ("actor_loss", "critic_loss", "ent_coef", "ent_coef_loss")
 DIAGNOSTICS = {
-    "PPO": (
-        "approx_kl",
-        "clip_fraction",
-        "entropy_loss",
-        "explained_variance",
-        "policy_gradient_loss",
-        "value_loss",
-    ),
+    "PPO": _PPO,
     "A2C": ("entropy_loss", "explained_variance", "policy_loss", "value_loss"),
+    "MaskablePPO": _PPO,
+    "RecurrentPPO": _PPO,
+    "TRPO": ("explained_variance", "kl_divergence_loss", "policy_objective", "value_loss"),
+    "SAC": _SAC,
+    "TQC": _SAC,
+    "CrossQ": _SAC,
+    "TD3": ("actor_loss", "critic_loss"),
+    "DQN": ("loss",),
+    "QRDQN": ("loss",),
 }
 """What each algorithm logs under ``train/`` after an update."""
 
@@ -63,6 +72,17 @@ HYPERPARAMETERS = (
     "normalize_advantage",
     "target_kl",
     "use_sde",
+    "buffer_size",
+    "learning_starts",
+    "gradient_steps",
+    "tau",
+    "policy_delay",
+    "target_policy_noise",
+    "target_noise_clip",
+    "target_update_interval",
+    "exploration_fraction",
+    "exploration_initial_eps",
+    "exploration_final_eps",
 )
 """Attributes of a model that are hyper-parameters with plain values."""
 
@@ -73,58 +93,16 @@ ACTIVATIONS: dict[type[nn.Module], str] = {
     nn.LeakyReLU: "leaky_relu",
 }
 """Modules between layers, and what they are called in the metadata."""
-_CRITIC = (
-    "value_net.",
-    "mlp_extractor.value_net.",
-    "vf_features_extractor.",
-    "lstm_critic.",  # of sb3_contrib's recurrent policies
-    "critic.",
-)
 
 
-def check_model(model: BaseAlgorithm) -> OnPolicyAlgorithm:
-    """The model, if its weights can be collected.
-
-    Raises:
-        CollectError: it is no on-policy algorithm with one optimizer.
-    """
-    names = [
-        f"{prefix}.{name}".lstrip(".")
-        for prefix, module in model.policy.named_modules()
-        for name, value in vars(module).items()
-        if isinstance(value, torch.optim.Optimizer)
-    ]
-    if names != ["optimizer"]:
-        raise CollectError(
-            "the collector counts the steps of one optimizer, and this policy has another number",
-            expected="policy.optimizer, as in PPO and A2C",
-            got=names,
-            where=type(model).__name__,
-            do="collect PPO or A2C, or write snapshots yourself with weighttraj.RunWriter",
-        )
-    if not isinstance(model, OnPolicyAlgorithm):
-        raise CollectError(
-            "only on-policy algorithms can be collected by this callback",
-            expected="PPO or A2C",
-            got=type(model).__name__,
-            do="write snapshots yourself with weighttraj.RunWriter",
-        )
-    return model
-
-
-def actor_parameters(policy: ActorCriticPolicy) -> dict[str, nn.Parameter]:
-    """Parameters that the policy acts with, in the order of the flat vector."""
-    named = policy.named_parameters()
-    return {name: p for name, p in named if not name.startswith(_CRITIC)}
-
-
-def critic_parameters(policy: ActorCriticPolicy) -> dict[str, nn.Parameter]:
-    """Parameters that only the critic uses."""
-    return {name: p for name, p in policy.named_parameters() if name.startswith(_CRITIC)}
+def diagnostics_of(model: BaseAlgorithm) -> tuple[str, ...]:
+    """Return the names that an algorithm, or the one that it derives from, logs after an update."""
+    kinds = [kind.__name__ for kind in type(model).__mro__ if kind.__name__ in DIAGNOSTICS]
+    return DIAGNOSTICS[kinds[0]] if kinds else ()
 
 
 def describe_run(
-    model: OnPolicyAlgorithm,
+    agent: Agent,
     norm: Normalizers,
     *,
     run_id: str,
@@ -137,7 +115,7 @@ def describe_run(
     """The metadata of a run, before its training.
 
     Args:
-        model: what will be trained.
+        agent: what will be trained.
         norm: its normalisers.
         run_id: id of the run.
         every: gradient steps from one snapshot to the next.
@@ -146,23 +124,23 @@ def describe_run(
         probe_observations: network inputs kept of each rollout.
         block: snapshots in a chunk and in a commit.
     """
-    policy = describe_policy(model.policy, norm.unknown)
+    model, on_policy = agent.model, agent.on_policy
+    policy = describe_agent(agent, norm.unknown)
     probes = probe_observations if policy.observation_shape else 0
-    of_critic = describe_layout(critic_parameters(model.policy), policy)
     return RunInfo(
         run_id=run_id,
-        layout=describe_layout(actor_parameters(model.policy), policy),
+        layout=describe_layout(agent.actor, policy),
         policy=policy,
         env=describe_env(model, norm),
-        algorithm=describe_algorithm(model),
+        algorithm=describe_algorithm(agent),
         seed=model.seed,
-        cadence=describe_cadence(model, every),
+        cadence=describe_cadence(agent, every),
         obs_norm=norm.obs_norm,
         ret_norm=norm.read_ret is not None,
-        diagnostics=(*DIAGNOSTICS.get(type(model).__name__, ()), "ep_rew_mean"),
-        critic_layout=of_critic if critic else None,
+        diagnostics=(*diagnostics_of(model), "ep_rew_mean"),
+        critic_layout=describe_layout(agent.critic, policy) if critic else None,
         optimizer_moments=optimizer_moments,
-        probe_observations=min(probes, model.n_steps * model.n_envs),
+        probe_observations=min(probes, on_policy.n_steps * on_policy.n_envs) if on_policy else 0,
         provenance=describe_provenance(),
         block=block,
     )
@@ -178,32 +156,30 @@ def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> 
     tensors: dict[str, tuple[tuple[int, ...], Role, tuple[str, ...]]] = {}
     for name, parameter in parameters.items():
         shape = tuple(parameter.shape)
-        label = "action" if name == "log_std" and policy.layers else "fixed"
-        labels = axes.get(name, (label,) * len(shape))
+        labels = axes.get(name, ("action" if name == "log_std" else "fixed",) * len(shape))
         tensors[name] = (shape, _role(name), labels)
     return ParamLayout.of(tensors)
 
 
+def describe_agent(agent: Agent, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
+    """Return what it takes to rebuild the network that acts, or the reasons why it cannot be."""
+    network = agent.network
+    if isinstance(network, ActorCriticPolicy):
+        return describe_policy(network, unknown_wrappers)
+    space = network.observation_space
+    return PolicySpec(
+        kind="other",
+        observation_shape=tuple(space.shape or ()) if isinstance(space, spaces.Box) else (),
+        cannot_rebuild=(f"policy class {type(network).__name__}",),
+    )
+
+
 def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
-    """What it takes to rebuild the policy, or the reasons why it cannot be.
-
-    A description without reasons is proven: the policy that is rebuilt from it acts as this one.
-    """
-    spec, reasons = _network(policy)
-    if not reasons:
-        reasons = find_difference(policy, spec, describe_layout(actor_parameters(policy), spec))
-    if reasons:  # what the layers are for is then unknown
-        spec = replace(spec, layers=(), activation="")
-    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
-    return replace(spec, kind="other" if reasons else "mlp", cannot_rebuild=tuple(reasons))
-
-
-def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
-    """The policy as a multilayer perceptron, and the reasons why it is certainly none."""
+    """What it takes to rebuild the policy, or the reasons why it cannot be."""
     space = policy.observation_space
     layers, activation, reasons = _mlp(policy)
     head, odd = describe_head(policy.action_space)
-    if getattr(policy, "use_sde", False):
+    if policy.use_sde:
         head, odd = {"head": "other"}, ["state-dependent exploration"]
     reasons += odd
     if policy.squash_output:
@@ -212,37 +188,15 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
         reasons.append(f"observations in a {type(space).__name__} space")
     if is_image_space(space):
         reasons.append("observations that SB3 takes for images and scales")
-    if layers:
-        wanted = {name for pair in layers for name in pair}
-        gaussian = {"log_std"} if head["head"] == "gaussian" else set()
-        reasons += _other_parameters(policy, wanted | gaussian)
-    spec = PolicySpec(
-        kind="mlp",
+    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
+    return PolicySpec(
+        kind="other" if reasons else "mlp",
         activation=activation,
         layers=layers,
         observation_shape=tuple(space.shape or ()) if isinstance(space, spaces.Box) else (),
+        cannot_rebuild=tuple(reasons),
         **head,
     )
-    return spec, reasons
-
-
-def _other_parameters(policy: ActorCriticPolicy, wanted: set[str]) -> list[str]:
-    """Reasons why the parameters are not those of a multilayer perceptron."""
-    parameters = actor_parameters(policy)
-    reasons = []
-    if more := sorted(parameters.keys() - wanted):
-        reasons.append(f"parameters that no multilayer perceptron has: {_few(more)}")
-    if missing := sorted(wanted - parameters.keys()):
-        reasons.append(
-            "parameters that are shared, compiled, parametrised or missing: " + _few(missing)
-        )
-    if types := sorted({str(p.dtype) for p in parameters.values()} - {"torch.float32"}):
-        reasons.append(f"parameters in {', '.join(types)}, which are stored as float32")
-    return reasons
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
@@ -262,7 +216,7 @@ def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
     return {"head": "other"}, [f"actions in {space}"]
 
 
-def describe_env(model: OnPolicyAlgorithm, norm: Normalizers) -> EnvInfo | None:
+def describe_env(model: BaseAlgorithm, norm: Normalizers) -> EnvInfo | None:
     """The environment as Gymnasium's registry knows it; None: it is not registered."""
     spec = model.env.get_attr("spec", indices=[0])[0] if model.env is not None else None
     if spec is None:
@@ -277,23 +231,23 @@ def describe_env(model: OnPolicyAlgorithm, norm: Normalizers) -> EnvInfo | None:
     )
 
 
-def describe_algorithm(model: OnPolicyAlgorithm, collector: str = "") -> Algorithm:
+def describe_algorithm(agent: Agent, collector: str = "") -> Algorithm:
     """Name and hyper-parameters; schedules become tables over the progress that remains.
 
     Args:
-        model: SB3's model.
+        agent: what is trained.
         collector: who trains in its place; empty: SB3.
     """
+    model = agent.model
     values = {n: _plain(getattr(model, n)) for n in HYPERPARAMETERS if hasattr(model, n)}
     for name in ("lr_schedule", "clip_range", "clip_range_vf"):
         schedule = getattr(model, name, None)
         if callable(schedule):
             values[name] = [[p, float(schedule(p))] for p in (1.0, 0.75, 0.5, 0.25, 0.0)]
     values["policy_kwargs"] = _plain(model.policy_kwargs)
-    values["optimizer"] = {
-        "class": type(model.policy.optimizer).__name__,
-        **_plain({k: v for k, v in model.policy.optimizer.defaults.items() if v is not None}),
-    }
+    if agent.optimizer is not None:
+        defaults = {k: v for k, v in agent.optimizer.defaults.items() if v is not None}
+        values["optimizer"] = {"class": type(agent.optimizer).__name__, **_plain(defaults)}
     sb3 = f"stable-baselines3 {importlib.metadata.version('stable-baselines3')}"
     return Algorithm(
         name=type(model).__name__,
@@ -302,14 +256,23 @@ def describe_algorithm(model: OnPolicyAlgorithm, collector: str = "") -> Algorit
     )
 
 
-def describe_cadence(model: OnPolicyAlgorithm, every: int) -> Cadence:
-    """When snapshots are taken."""
-    steps: int | None = 1
-    if hasattr(model, "n_epochs"):
-        batch_size: int = getattr(model, "batch_size")  # noqa: B009
-        minibatches = -(-model.n_steps * model.n_envs // batch_size)
-        steps = model.n_epochs * minibatches if getattr(model, "target_kl", None) is None else None
-    return Cadence(every=every, gradient_steps_per_iteration=steps)
+def describe_cadence(agent: Agent, every: int) -> Cadence:
+    """Return when snapshots are taken."""
+    if agent.unit == "update":
+        steps: int | None = 1
+    else:
+        steps = _steps_of_an_update(agent.model)
+    return Cadence(every=every, unit=agent.unit, gradient_steps_per_iteration=steps)
+
+
+def _steps_of_an_update(model: BaseAlgorithm) -> int | None:
+    """Return the optimizer's steps between two rollouts; None: it varies, or is not known."""
+    train = getattr(type(model), "train", None)
+    if train is A2C.train:
+        return 1
+    if train is not PPO.train or not isinstance(model, PPO) or model.target_kl is not None:
+        return None
+    return model.n_epochs * -(-model.n_steps * model.n_envs // model.batch_size)
 
 
 def describe_provenance() -> Provenance:
@@ -338,8 +301,6 @@ def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, l
         reasons.append(f"features from {type(policy.features_extractor).__name__}")
     if any(True for _ in policy.buffers()):
         reasons.append("buffers beside the parameters, which are not stored")
-    if any(getattr(module, "_compiled_call_impl", None) for module in policy.modules()):
-        reasons.append("layers compiled by torch.compile, which may move the last bits")
     net = getattr(getattr(policy, "mlp_extractor", None), "policy_net", None)
     if not isinstance(net, nn.Sequential) or not isinstance(policy.action_net, nn.Linear):
         return (), "", [*reasons, f"policy class {type(policy).__name__} with no policy_net"]

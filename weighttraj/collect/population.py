@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from weighttraj import environments
-from weighttraj.collect.describe import actor_parameters, critic_parameters
+from weighttraj.collect.agents import actor_parameters, critic_parameters
 from weighttraj.collect.learners import Learners, Rollout
 from weighttraj.collect.networks import MLP, Stack
 from weighttraj.collect.ppo import PPOConfig, make_ppo

@@ -14,6 +14,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from weighttraj.collect.agents import find_agent
 from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.describe import describe_algorithm, describe_run
 from weighttraj.collect.normalizers import find_normalizers
@@ -113,9 +114,9 @@ def open_recorder(
         FormatError: the run at the path was started with other settings.
         ReplayError: it begins otherwise.
     """
-    model = origin.model
+    model, agent = origin.model, find_agent(origin.model)
     info = describe_run(
-        model,
+        agent,
         find_normalizers(cast(VecEnv, model.get_env())),
         run_id=path.name.removesuffix(".zarr"),
         every=store.every,
@@ -126,7 +127,7 @@ def open_recorder(
     )
     return Recorder(
         path,
-        replace(info, algorithm=describe_algorithm(model, "weighttraj's population")),
+        replace(info, algorithm=describe_algorithm(agent, "weighttraj's population")),
         lambda: population.read(learner, critic=store.critic, moments=store.optimizer_moments),
         every=store.every,
         steps_per_epoch=model.n_steps // model.batch_size,

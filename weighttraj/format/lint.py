@@ -43,8 +43,9 @@ def lint(path: str | Path, *, console: Console | None = None) -> list[Finding]:
     last one, as when a mirror serves final weights under every name), ``gap`` (counters that do
     not follow the cadence), ``order`` (counters that go back), ``jump`` (a step far longer than
     those around it), ``finite``, ``constant`` (parameters that never change), ``normalizer`` (an
-    agent without recorded normaliser), ``short`` (fewer snapshots than the other runs have),
-    ``twin`` (runs with the same weights).
+    agent without recorded normaliser), ``start`` (a run that begins with a trained policy of
+    unknown origin, or a data set that trains on a run and tests on its continuation), ``short``
+    (fewer snapshots than the other runs have), ``twin`` (runs with the same weights).
 
     Args:
         path: data set or run.
@@ -65,8 +66,21 @@ def lint_run(run: Run) -> list[Finding]:
     """What is suspicious about one run."""
     if not len(run):
         return [Finding(check="short", run=run.id, message="no snapshots")]
-    found = [*_duplicates(run), *_counters(run), *_weights(run), *_normalizer(run)]
+    checks = (_start, _duplicates, _counters, _weights, _normalizer)
+    found = [finding for check in checks for finding in check(run)]
     return [Finding(check=check, run=run.id, message=message) for check, message in found]
+
+
+def _start(run: Run) -> Iterator[tuple[str, str]]:
+    origin, steps = run.info.continues, int(run.num_timesteps[0])
+    if origin is not None and not origin.run_id:
+        yield (
+            "start",
+            f"starts from a trained model: num_timesteps {origin.num_timesteps} at the start; "
+            "which run it continues is not recorded",
+        )
+    if origin is None and steps > 0:
+        yield "start", f"begins at num_timesteps {steps}: what was before is not stored"
 
 
 def _duplicates(run: Run) -> Iterator[tuple[str, str]]:
@@ -140,7 +154,26 @@ def _normalizer(run: Run) -> Iterator[tuple[str, str]]:
             yield "normalizer", f"wrappers {named} normalise, but no statistics are stored"
 
 
+def _continued(runs: Sequence[Run]) -> Iterator[Finding]:
+    """Runs of one training that are taken for independent ones."""
+    by_id = {run.id: run for run in runs}
+    for run in runs:
+        origin = run.info.continues
+        source = by_id.get(origin.run_id) if origin is not None else None
+        if source is None or origin is None:
+            continue
+        digests = source["digest"][:]
+        t = origin.snapshot
+        if not 0 <= t < len(digests) or digests[t].tobytes().hex() != origin.digest:
+            message = f"continues snapshot {t} of {source.id}, which is another one here"
+            yield Finding(check="start", run=run.id, message=message)
+        elif run.split != source.split:
+            message = f"split {run.split!r}, and goes on from {source.id} in {source.split!r}"
+            yield Finding(check="start", run=run.id, message=message)
+
+
 def _between(runs: Sequence[Run]) -> Iterator[Finding]:
+    yield from _continued(runs)
     lengths = defaultdict(list)
     ends = defaultdict(list)
     for run in runs:

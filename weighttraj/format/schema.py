@@ -102,6 +102,9 @@ class Cadence:
 
     every: int
     """Gradient steps from one snapshot to the next."""
+    unit: Literal["gradient_step", "update"] = "gradient_step"
+    """What ``index/gradient_step`` counts: steps of the optimizer, or updates of the policy, each
+    of which is all that changed its weights between two rollouts."""
     gradient_steps_per_iteration: int | None = None
     """Gradient steps of one iteration (rollout and update); None: it varies."""
 
@@ -136,6 +139,32 @@ class Provenance:
     """Command line."""
     commit: str = ""
     """Version-control commit of the working directory; empty: none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Continuation:
+    """The training that a run goes on from: its first snapshot is no fresh initialisation."""
+
+    num_timesteps: int
+    """Environment steps that the policy had been trained for when the run began, as far as the
+    model told: 0 where its counter had been reset."""
+    run_id: str = ""
+    """Id of the run that it continues; empty: not known. Counters then begin at 0."""
+    snapshot: int = -1
+    """Which snapshot of that run the first one of this run equals; -1: not known."""
+    digest: str = ""
+    """SHA-256 (hex) of that snapshot's weights, as its row of ``digest``; empty: not known."""
+
+    def __post_init__(self) -> None:
+        if self.run_id:
+            check_id(self.run_id, "run id")
+        if not (0 <= self.num_timesteps <= _MAX_COUNT and -1 <= self.snapshot <= _MAX_COUNT):
+            raise FormatError(
+                "a number of a run's origin is out of range",
+                expected="num_timesteps 0 to 2**48, snapshot -1 to 2**48",
+                got=f"num_timesteps {self.num_timesteps}, snapshot {self.snapshot}",
+                do="restore the run's zarr.json from a copy",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,6 +228,9 @@ class RunInfo:
     """Seed of the run."""
     cadence: Cadence | None = None
     """When snapshots were taken; None: not said."""
+    continues: Continuation | None = None
+    """Training that the run goes on from; None: it begins with an untrained policy, or a version
+    before this key was written."""
     obs_norm: ObsNorm | None = None
     """Observation normaliser; None: the run has none."""
     ret_norm: bool = False

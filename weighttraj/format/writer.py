@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,7 +60,8 @@ class RunWriter:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lock = lock_run(path)
         try:
-            if resume and path.exists():
+            self._is_new = not (resume and path.exists())
+            if not self._is_new:
                 self._store = _reopen(path, info)
             else:
                 info = replace(info, evaluation=None)  # of another run, if there is one
@@ -188,6 +190,17 @@ class RunWriter:
             self.flush(status)
         finally:
             self._lock.release()
+
+    def discard(self) -> None:
+        """Delete the run if this writer began it, else mark it ``crashed``; release the lock."""
+        if not self._is_new:
+            self.close("crashed")
+        elif not self._closed:
+            self._closed = True
+            try:
+                shutil.rmtree(self.path)
+            finally:
+                self._lock.release()
 
     def __enter__(self) -> RunWriter:
         return self
