@@ -21,6 +21,8 @@ from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.collect.agents import actor_parameters
 from weighttraj.errors import CollectError
 
+pytestmark = pytest.mark.filterwarnings("ignore:the weights of this training are recorded")
+
 ON = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "seed": 0, "device": "cpu"}
 
 

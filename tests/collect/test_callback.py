@@ -358,7 +358,9 @@ def test_other_policies_are_recorded_all_the_same(
     make: Callable[[], PPO], reason: str, tmp_path: Path
 ) -> None:
     model = make()
-    model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr", every=4))
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=4)
+    with pytest.warns(UserWarning, match=reason):
+        model.learn(64, callback=callback)
     run = wt.open_run(tmp_path / "run.zarr")
     model.get_env().close()  # type: ignore[union-attr]
     assert np.array_equal(run.weights[-1], flat(model))
@@ -571,7 +573,9 @@ def test_a_wrapper_that_changes_observations_or_actions_is_named(
     make: Callable[[], Any], name: str, tmp_path: Path
 ) -> None:
     model = PPO("MlpPolicy", make(), n_steps=32, batch_size=32, n_epochs=1, device="cpu")
-    model.learn(64, callback=WeightTrajectoryCallback(tmp_path / "run.zarr"))
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr")
+    with pytest.warns(UserWarning, match=f"environment wrapper {name}"):
+        model.learn(64, callback=callback)
     run = wt.open_run(tmp_path / "run.zarr")
     with pytest.raises(PolicyError, match=f"environment wrapper {name}"):
         run.load_policy()

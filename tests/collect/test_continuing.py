@@ -19,6 +19,8 @@ from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.errors import CollectError
 from weighttraj.format import Continuation, lint
 
+pytestmark = pytest.mark.filterwarnings("ignore:the weights of this training are recorded")
+
 SETTINGS: dict[str, Any] = {"n_steps": 32, "batch_size": 16, "n_epochs": 1, "device": "cpu"}
 
 

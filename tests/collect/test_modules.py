@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from torch import nn
 
+import weighttraj as wt
 from weighttraj.collect import describe_mlp
 from weighttraj.collect.agents import actor_parameters
 from weighttraj.collect.describe import describe_layout, describe_policy
-from weighttraj.errors import CollectError
+from weighttraj.errors import CollectError, PolicyError
 from weighttraj.policies.policy import Policy
 
 BOX = spaces.Box(-1, 1, (3,))
@@ -72,3 +77,56 @@ def test_what_is_no_perceptron_is_refused(
 def test_one_layer_is_a_perceptron() -> None:
     layout, spec = describe_mlp(nn.Sequential(nn.Linear(3, 2)), BOX, spaces.Discrete(2))
     assert (layout.size, spec.activation, spec.layers) == (8, "", (("0.weight", "0.bias"),))
+
+
+CARTPOLE = (spaces.Box(-1, 1, (4,)), spaces.Discrete(2))
+
+
+class Halves(nn.Linear):
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        return super().forward(inputs) / 2
+
+
+def hooked() -> nn.Sequential:
+    actor = nn.Sequential(nn.Linear(4, 2))
+    actor[0].register_forward_hook(lambda _, __, outputs: outputs + 1)
+    return actor
+
+
+@pytest.mark.parametrize(
+    ("actor", "said"),
+    [
+        (nn.Sequential(nn.Linear(5, 3)), r"\(4,\) has 4 numbers, and 0.weight takes 5"),
+        (nn.Sequential(nn.Linear(4, 3)), "2 actions, and 0.bias has 3 numbers"),
+        (
+            nn.Sequential(nn.Linear(4, 8), nn.Tanh(), nn.Linear(7, 2)),
+            "0.weight gives 8 numbers, and 2.weight takes 7",
+        ),
+        (nn.Sequential(nn.Linear(4, 8), nn.Tanh(), Halves(8, 2)), "differ from those of its"),
+        (hooked(), "differ from those of its layers"),
+        (nn.Sequential(nn.Linear(4, 2)).double(), "compared with its description"),
+    ],
+)
+def test_a_network_that_does_not_fit_its_description_is_refused(
+    actor: nn.Sequential, said: str
+) -> None:
+    with pytest.raises(CollectError, match=said):
+        describe_mlp(actor, *CARTPOLE)
+
+
+def test_means_for_another_number_of_actions_are_refused() -> None:
+    with pytest.raises(CollectError, match=r"gives 2 numbers, and an action \(3,\) has 3"):
+        describe_mlp(nn.Sequential(nn.Linear(3, 2)), BOX, BOX)
+
+
+def test_a_stored_policy_that_does_not_fit_is_named_and_refused(tmp_path: Path) -> None:
+    layout, policy = describe_mlp(nn.Sequential(nn.Linear(4, 2)), *CARTPOLE)
+    wrong = replace(policy, observation_shape=(5,))
+    info = wt.RunInfo(run_id="wrong", layout=layout, policy=wrong)
+    with wt.RunWriter(tmp_path / "wrong.zarr", info) as writer:
+        writer.append(np.zeros(layout.size, np.float32), num_timesteps=0)
+    said = r"observation \(5,\) has 5 numbers, and 0.weight takes 4"
+    with pytest.raises(PolicyError, match=said):
+        wt.open_run(tmp_path / "wrong.zarr").load_policy(0)
+    (problem,) = wt.verify(tmp_path / "wrong.zarr")
+    assert "the policy does not fit its parameters" in problem

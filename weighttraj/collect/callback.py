@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +21,7 @@ from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.origin import find_origin, find_source
 from weighttraj.collect.recorder import Counters, Reading, Recorder
 from weighttraj.collect.watch import Watch
-from weighttraj.errors import CollectError
+from weighttraj.errors import CollectError, PolicyError
 from weighttraj.format import Run, RunInfo, RunWriter
 from weighttraj.format.schema import Status
 
@@ -158,6 +159,7 @@ class WeightTrajectoryCallback(BaseCallback):
         self._norm = find_normalizers(self.model.get_env() or self.training_env)
         self._check_options()
         info, counters = self._describe()
+        _warn_if_lost(info, self.path)
         steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
         self._recorder = Recorder(
             self.path,
@@ -320,6 +322,19 @@ class WeightTrajectoryCallback(BaseCallback):
             return _flat([state.get(p, {}).get(name, torch.zeros_like(p)) for p in parameters])
 
         return read("exp_avg"), read("exp_avg_sq")
+
+
+def _warn_if_lost(info: RunInfo, path: Path) -> None:
+    """Tell the trainer, before the training begins, that the run's policies cannot be rebuilt."""
+    if info.policy.cannot_rebuild:
+        text = PolicyError(
+            "the weights of this training are recorded, but run.load_policy(t) cannot rebuild "
+            "its policies from them",
+            got="; ".join(info.policy.cannot_rebuild),
+            where=path,
+            do="load snapshots into a model of your own with run.load_into(model, t)",
+        )
+        warnings.warn(text.message, UserWarning, stacklevel=2)
 
 
 def _flat(tensors: list[torch.Tensor]) -> np.ndarray:

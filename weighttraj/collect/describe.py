@@ -6,6 +6,7 @@ import importlib.metadata
 import platform
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,9 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from weighttraj.collect.agents import Agent
+from weighttraj.collect.agents import Agent, actor_parameters
 from weighttraj.collect.normalizers import Normalizers
+from weighttraj.collect.proof import find_difference
 from weighttraj.format import (
     Algorithm,
     Cadence,
@@ -156,7 +158,8 @@ def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> 
     tensors: dict[str, tuple[tuple[int, ...], Role, tuple[str, ...]]] = {}
     for name, parameter in parameters.items():
         shape = tuple(parameter.shape)
-        labels = axes.get(name, ("action" if name == "log_std" else "fixed",) * len(shape))
+        label = "action" if name == "log_std" and policy.layers else "fixed"
+        labels = axes.get(name, (label,) * len(shape))
         tensors[name] = (shape, _role(name), labels)
     return ParamLayout.of(tensors)
 
@@ -175,11 +178,25 @@ def describe_agent(agent: Agent, unknown_wrappers: tuple[str, ...]) -> PolicySpe
 
 
 def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
-    """What it takes to rebuild the policy, or the reasons why it cannot be."""
+    """What it takes to rebuild the policy, or the reasons why it cannot be.
+
+    A description without reasons is proven: the policy that is rebuilt from it acts as this one.
+    """
+    spec, reasons = _network(policy)
+    if not reasons:
+        reasons = find_difference(policy, spec, describe_layout(actor_parameters(policy), spec))
+    if reasons:  # what the layers are for is then unknown
+        spec = replace(spec, layers=(), activation="")
+    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
+    return replace(spec, kind="other" if reasons else "mlp", cannot_rebuild=tuple(reasons))
+
+
+def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
+    """The policy as a multilayer perceptron, and the reasons why it is certainly none."""
     space = policy.observation_space
     layers, activation, reasons = _mlp(policy)
     head, odd = describe_head(policy.action_space)
-    if policy.use_sde:
+    if getattr(policy, "use_sde", False):
         head, odd = {"head": "other"}, ["state-dependent exploration"]
     reasons += odd
     if policy.squash_output:
@@ -188,15 +205,37 @@ def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]
         reasons.append(f"observations in a {type(space).__name__} space")
     if is_image_space(space):
         reasons.append("observations that SB3 takes for images and scales")
-    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
-    return PolicySpec(
-        kind="other" if reasons else "mlp",
+    if layers:
+        wanted = {name for pair in layers for name in pair}
+        gaussian = {"log_std"} if head["head"] == "gaussian" else set()
+        reasons += _other_parameters(policy, wanted | gaussian)
+    spec = PolicySpec(
+        kind="mlp",
         activation=activation,
         layers=layers,
         observation_shape=tuple(space.shape or ()) if isinstance(space, spaces.Box) else (),
-        cannot_rebuild=tuple(reasons),
         **head,
     )
+    return spec, reasons
+
+
+def _other_parameters(policy: ActorCriticPolicy, wanted: set[str]) -> list[str]:
+    """Reasons why the parameters are not those of a multilayer perceptron."""
+    parameters = actor_parameters(policy)
+    reasons = []
+    if more := sorted(parameters.keys() - wanted):
+        reasons.append(f"parameters that no multilayer perceptron has: {_few(more)}")
+    if missing := sorted(wanted - parameters.keys()):
+        reasons.append(
+            "parameters that are shared, compiled, parametrised or missing: " + _few(missing)
+        )
+    if types := sorted({str(p.dtype) for p in parameters.values()} - {"torch.float32"}):
+        reasons.append(f"parameters in {', '.join(types)}, which are stored as float32")
+    return reasons
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
@@ -301,6 +340,8 @@ def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, l
         reasons.append(f"features from {type(policy.features_extractor).__name__}")
     if any(True for _ in policy.buffers()):
         reasons.append("buffers beside the parameters, which are not stored")
+    if any(getattr(module, "_compiled_call_impl", None) for module in policy.modules()):
+        reasons.append("layers compiled by torch.compile, which may move the last bits")
     net = getattr(getattr(policy, "mlp_extractor", None), "policy_net", None)
     if not isinstance(net, nn.Sequential) or not isinstance(policy.action_net, nn.Linear):
         return (), "", [*reasons, f"policy class {type(policy).__name__} with no policy_net"]

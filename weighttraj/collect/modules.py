@@ -7,8 +7,10 @@ from gymnasium import spaces
 from torch import nn
 
 from weighttraj.collect.describe import ACTIVATIONS, describe_head, describe_layout
+from weighttraj.collect.proof import find_difference_of_network
 from weighttraj.errors import CollectError
 from weighttraj.format import ParamLayout, PolicySpec
+from weighttraj.format.fit import find_misfit
 
 
 def describe_mlp(
@@ -32,7 +34,8 @@ def describe_mlp(
         action_space: of the environment, ``Box`` or ``Discrete``.
 
     Raises:
-        CollectError: the network or a space is something else.
+        CollectError: the network or a space is something else, they do not fit each other, or the
+            network computes something else than its layers do.
     """
     linear = [i for i, module in enumerate(actor) if isinstance(module, nn.Linear)]
     between = [module for module in actor if not isinstance(module, nn.Linear)]
@@ -64,7 +67,29 @@ def describe_mlp(
     parameters = dict(actor.named_parameters())
     if isinstance(action_space, spaces.Box):
         parameters |= {"log_std": nn.Parameter(torch.zeros(action_space.shape))}
-    return describe_layout(parameters, policy), policy
+    layout = describe_layout(parameters, policy)
+    problem = find_misfit(policy, layout) or _misfit_of_choices(policy, layout, action_space)
+    if problem := problem or find_difference_of_network(actor, policy, layout):
+        raise CollectError(
+            "the network does not fit its description as a multilayer perceptron",
+            expected=f"a network from observations {observation_space} to actions {action_space}, "
+            "of plain linear layers",
+            got=problem,
+            where=actor,
+            do="pass the network and the spaces of one training; for another kind of network "
+            "write a ParamLayout yourself, the run then has weights, and no policies that act",
+        )
+    return layout, policy
+
+
+def _misfit_of_choices(
+    policy: PolicySpec, layout: ParamLayout, action_space: spaces.Space[object]
+) -> str:
+    """Why the last layer does not choose among the actions; empty: it does."""
+    last = policy.layers[-1][1]
+    if not isinstance(action_space, spaces.Discrete) or layout[last].size == action_space.n:
+        return ""
+    return f"there are {action_space.n} actions, and {last} has {layout[last].size} numbers"
 
 
 __all__ = ["describe_mlp"]

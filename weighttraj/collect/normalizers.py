@@ -51,8 +51,10 @@ class Normalizers:
 
     obs_norm: ObsNorm | None
     """What is fixed about the observation normaliser; None: there is none."""
+    live_obs: Callable[[], Any] | None
+    """Returns the trainer's own statistics, with ``mean``, ``var`` and ``count``."""
     read_obs: Callable[[], Moments] | None
-    """Copies its statistics."""
+    """Copies them."""
     read_ret: Callable[[], Moments] | None
     """Copies the reward normaliser's statistics; None: there is none."""
     wrappers: tuple[str, ...]
@@ -87,12 +89,13 @@ def find_normalizers(env: VecEnv) -> Normalizers:
             got=[spec.source for spec, _ in sources],
             do="use either gymnasium's NormalizeObservation or SB3's VecNormalize",
         )
-    obs_norm, read_obs = sources[0] if sources else (None, None)
+    obs_norm, live_obs = sources[0] if sources else (None, None)
     ret_stats: list[Any] = [w.ret_rms for w in vec_normalize if w.norm_reward]
     ret_stats += [w.return_rms for w in ret_sources]
     return Normalizers(
         obs_norm=obs_norm,
-        read_obs=read_obs,
+        live_obs=live_obs,
+        read_obs=None if live_obs is None else lambda: _copy(live_obs()),
         read_ret=(lambda: _copy(ret_stats[0])) if ret_stats else None,
         wrappers=tuple(type(w).__name__ for w in (*vec_wrappers, base, *chain)),
         unknown=tuple(unknown),
@@ -180,7 +183,7 @@ def _has_array_stats(wrapper: VecNormalize) -> bool:
     return not wrapper.norm_obs or not isinstance(wrapper.obs_rms, dict)
 
 
-def _vec_obs(wrapper: VecNormalize) -> tuple[ObsNorm, Callable[[], Moments]]:
+def _vec_obs(wrapper: VecNormalize) -> tuple[ObsNorm, Callable[[], Any]]:
     spec = ObsNorm(
         source="stable_baselines3.VecNormalize",
         epsilon=wrapper.epsilon,
@@ -189,12 +192,12 @@ def _vec_obs(wrapper: VecNormalize) -> tuple[ObsNorm, Callable[[], Moments]]:
         clip_high=wrapper.clip_obs,
         cast_before_clip=False,
     )
-    return spec, lambda: _copy(wrapper.obs_rms)
+    return spec, lambda: wrapper.obs_rms
 
 
 def _gymnasium_obs(
     chain: list[Any], wrapper: gw.NormalizeObservation[Any, Any, Any]
-) -> tuple[ObsNorm, Callable[[], Moments]]:
+) -> tuple[ObsNorm, Callable[[], Any]]:
     outside = chain[: chain.index(wrapper)]
     bounds = [b for w in outside if (b := _clip_bounds(w)) is not None]
     low, high = (
@@ -208,7 +211,7 @@ def _gymnasium_obs(
         clip_high=high,
         dtype=str(wrapper.obs_rms.mean.dtype),
     )
-    return spec, lambda: _copy(wrapper.obs_rms)
+    return spec, lambda: wrapper.obs_rms
 
 
 def _clip_bounds(wrapper: Any) -> tuple[float, float] | None:

@@ -25,6 +25,7 @@ from weighttraj.format.catalog import (
     write_dataset_info,
     write_manifest,
 )
+from weighttraj.format.fit import find_misfit
 from weighttraj.format.live import LiveStore
 from weighttraj.format.objects import ZipObjects, sync
 from weighttraj.format.packing import same_as_packed
@@ -173,6 +174,8 @@ def _verify_run(run: Run, *, deep: bool) -> Iterator[str]:
 
 
 def _verify_arrays(run: Run, *, deep: bool) -> Iterator[str]:
+    if misfit := find_misfit(run.info.policy, run.layout, run.info.obs_norm):
+        yield f"{run.path}, zarr.json: the policy does not fit its parameters: {misfit}"
     for name, array in run.arrays.items():
         if not deep and name != "policy/weights":
             continue

@@ -29,6 +29,7 @@ from weighttraj.format.storage import PACKED, RunStore
 from weighttraj.remote.address import Place, RemotePath, is_remote
 
 if TYPE_CHECKING:
+    from weighttraj.collect.into import Target
     from weighttraj.load.windows import SnapshotDataset, WindowDataset
     from weighttraj.policies.policy import Policy
 
@@ -319,6 +320,38 @@ class Run:
         from weighttraj.policies.policy import load_policy
 
         return load_policy(self, t)
+
+    def load_into(
+        self,
+        target: Target,
+        t: int = -1,
+        *,
+        normalizer: bool = True,
+        keep_buffers: bool = False,
+    ) -> None:
+        """Load the weights of snapshot t, and its observation normaliser, into your own model.
+
+        This works for every policy, also for those that ``load_policy`` cannot rebuild. Either
+        everything is loaded or nothing. The critic is loaded if the run stores it. Needs the extra
+        ``sb3``.
+
+        Args:
+            target: a Stable-Baselines3 model, whose environment holds the normaliser; a module; or
+                tensors by name. Names, shapes and types must be those of ``run.layout``.
+            t: snapshot, from 0; below 0 it counts from the end.
+            normalizer: load the statistics of the observation normaliser too. False: leave that of
+                the target alone.
+            keep_buffers: accept a target with buffers, such as the statistics of a batch
+                normalisation. No run stores them: they stay as they are.
+
+        Raises:
+            PolicyError: the target is another network, or has another normaliser; nothing was
+                changed.
+            IndexError: there is no such snapshot.
+        """
+        from weighttraj.collect.into import load_into
+
+        load_into(self, target, t, normalizer=normalizer, keep_buffers=keep_buffers)
 
     def _evaluated(self) -> Evaluation:
         if self.evaluation is None:

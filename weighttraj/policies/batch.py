@@ -45,7 +45,7 @@ class PolicyBatch:
         self.spec, self.layout, self.obs_norm = spec, layout, obs_norm
         self.weights = np.ascontiguousarray(weights, np.float32)
         self.mean, self.var = mean, var
-        layers, log_std = network(spec, layout, self.weights)
+        layers, log_std = network(spec, layout, self.weights, obs_norm)
         self._layers = [(weight.transpose(1, 2), bias[:, None]) for weight, bias in layers]
         self._std = None if log_std is None else log_std.exp()[:, None]
 

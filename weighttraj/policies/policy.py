@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from weighttraj.errors import PolicyError
 from weighttraj.format import ParamLayout, PolicySpec, Run
+from weighttraj.format.fit import find_misfit
 from weighttraj.format.reader import NormStats
 from weighttraj.format.schema import ObsNorm
 
@@ -55,7 +56,7 @@ class Policy:
         self.layout = layout
         self.obs_norm, self.stats = obs_norm, stats
         self.weights = np.array(weights, np.float32)
-        layers, self._log_std = network(spec, layout, self.weights)
+        layers, self._log_std = network(spec, layout, self.weights, obs_norm)
         # Matrix products give other last bits where a weight does not lie as torch aligns it.
         self._layers = [(weight.clone(), bias.clone()) for weight, bias in layers]
 
@@ -140,7 +141,10 @@ def load_policy(run: Run, t: int = -1) -> Policy:
 
 
 def network(
-    spec: PolicySpec, layout: ParamLayout, weights: Float32[np.ndarray, "*policy param"]
+    spec: PolicySpec,
+    layout: ParamLayout,
+    weights: Float32[np.ndarray, "*policy param"],
+    obs_norm: ObsNorm | None,
 ) -> tuple[list[tuple[Tensor, Tensor]], Tensor | None]:
     """(weight, bias) of each layer, and ``log_std`` if the head is Gaussian; views of ``weights``.
 
@@ -153,19 +157,19 @@ def network(
             expected="a fully connected network on flat observations, with a Gaussian or "
             f"categorical head and one of the activations {sorted(ACTIVATIONS)}",
             got="; ".join(spec.cannot_rebuild) or f"{spec.kind}, activation {spec.activation}",
-            do="rebuild it yourself from run.layout.unflatten(run.weights[t])",
+            do="load snapshots into a model of your own with run.load_into(model, t)",
+        )
+    if misfit := find_misfit(spec, layout, obs_norm):
+        raise PolicyError(
+            "the policy that the run describes does not fit its parameters",
+            expected="layers that follow each other from the observation to the action",
+            got=misfit,
+            do="describe the network that was trained (describe_mlp checks it), or restore the "
+            "run's zarr.json from a copy",
         )
     tensors = {name: torch.from_numpy(part) for name, part in layout.unflatten(weights).items()}
-    try:
-        layers = [(tensors[weight], tensors[bias]) for weight, bias in spec.layers]
-        return layers, tensors["log_std"] if spec.head == "gaussian" else None
-    except KeyError as error:
-        raise PolicyError(
-            "the policy names a parameter that its layout lacks",
-            expected=[spec.name for spec in layout.params],
-            got=error,
-            do="restore the run's zarr.json from a copy",
-        ) from error
+    layers = [(tensors[weight], tensors[bias]) for weight, bias in spec.layers]
+    return layers, tensors["log_std"] if spec.head == "gaussian" else None
 
 
 def normalize(
@@ -192,8 +196,12 @@ def to_actions(spec: PolicySpec, values: Tensor) -> np.ndarray:
     """
     if spec.head != "gaussian":
         return values.numpy()
-    low, high = (
-        np.array(x, np.float32).reshape(spec.action_shape)
-        for x in (spec.action_low, spec.action_high)
-    )
+    low, high = (_bound(x, spec.action_shape) for x in (spec.action_low, spec.action_high))
     return np.asarray(np.clip(values.numpy().reshape(*values.shape[:-1], *low.shape), low, high))
+
+
+def _bound(values: tuple[float, ...], shape: tuple[int, ...]) -> np.ndarray:
+    """Bounds of an action in float32, or in float64 where float32 would change them."""
+    exact = np.array(values, np.float64).reshape(shape)
+    short = exact.astype(np.float32)
+    return short if np.array_equal(short, exact) else exact
