@@ -138,7 +138,7 @@ ALLOWED = {
     "weighttraj.format.hdf5": [FORMAT, "weighttraj.errors"],
     "weighttraj.format.integrity": [FORMAT, "weighttraj.errors", REMOTE],
     "weighttraj.format": [FORMAT],
-    "weighttraj.environments": ["weighttraj.errors"],
+    "weighttraj.environments": ["weighttraj.errors", FORMAT],
     "weighttraj.collect": [
         "weighttraj.progress",
         "weighttraj.threads",

@@ -5,15 +5,122 @@ from __future__ import annotations
 import contextlib
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
 
-from weighttraj.errors import CollectError
+from weighttraj.errors import CollectError, PolicyError, WeightTrajError
+from weighttraj.format import EnvInfo
 
 
-def make(env_id: str, **kwargs: Any) -> gym.Env[Any, Any]:
+def remake(info: EnvInfo) -> gym.Env[Any, Any]:
+    """Make the environment that metadata describe. They may be a stranger's.
+
+    Raises:
+        CollectError: the id is not registered here.
+        PolicyError: it cannot be made again, or not with these keywords.
+    """
+    arguments = {k: v for k, v in info.kwargs.items() if k != "render_mode"}
+    if info.cannot_remake:
+        raise PolicyError(
+            f"this environment cannot be made again: {'; '.join(info.cannot_remake)}",
+            expected="an environment that its id and its recorded keywords make",
+            got=info.id,
+            do=OWN_ENVIRONMENT,
+        )
+    if wrong := sorted(_RESERVED & arguments.keys()):
+        raise PolicyError(
+            "the keywords of the environment contradict what is recorded beside them",
+            expected=f"other keywords than {', '.join(sorted(_RESERVED))}",
+            got=f"{info.id} with {wrong}",
+            do="correct env.kwargs of the run's metadata",
+        )
+    if info.max_episode_steps is not None:
+        arguments["max_episode_steps"] = info.max_episode_steps
+    with explained(info):
+        env = make(info.id, **arguments)
+    _refuse_endless_steps(env, info)
+    return env
+
+
+OWN_ENVIRONMENT = "pass a function that makes it: weighttraj.policies.evaluate(policy, my_function)"
+"""What to do about an environment that cannot be made again."""
+_RESERVED = {"id", "max_episode_steps"}
+_FRAMES = ("frame_skip", "frameskip", "_frameskip", "action_repeat")
+"""Names that environments have for the number of simulation steps in one of theirs."""
+_MOST_FRAMES = 10_000
+
+
+@contextlib.contextmanager
+def explained(info: EnvInfo) -> Iterator[None]:
+    """Turn whatever an environment raises into an error that names it and its keywords.
+
+    Raises:
+        PolicyError: the environment raised an error.
+    """
+    try:
+        yield
+    except WeightTrajError:
+        raise
+    except Exception as error:  # its code, and its keywords, may be a stranger's
+        raise PolicyError(
+            "the environment fails",
+            expected="an environment that works with its recorded keywords",
+            got=f"{type(error).__name__}: {str(error)[:1000]}",
+            where=f"{info.id}, keywords {str(info.kwargs)[:1000]}",
+            do="install the version of the environment that run.info.provenance names, or "
+            + OWN_ENVIRONMENT,
+        ) from error
+
+
+def _refuse_endless_steps(env: gym.Env[Any, Any], info: EnvInfo) -> None:
+    """Refuse an environment of which a single step takes for ever, and cannot be interrupted."""
+    counts = [vars(env.unwrapped).get(name) for name in _FRAMES]
+    counts += [info.kwargs.get(name) for name in _FRAMES]
+    found = [n for n in counts if isinstance(n, int | float) and not 1 <= n <= _MOST_FRAMES]
+    if found:
+        env.close()
+        raise PolicyError(
+            "the environment simulates too many frames in a step, or none",
+            expected=f"a frame skip from 1 to {_MOST_FRAMES:,}",
+            got=found[0],
+            where=info.id,
+            do=OWN_ENVIRONMENT,
+        )
+
+
+def made_by(function: Callable[[], Any]) -> gym.Env[Any, Any]:
+    """Make an environment with a user's function.
+
+    Raises:
+        PolicyError: the function fails, or returns something else.
+    """
+    with explained(EnvInfo(id=getattr(function, "__name__", str(function)))):
+        env = function()
+    if not isinstance(env, gym.Env):
+        raise PolicyError(
+            "the function makes no Gymnasium environment",
+            expected="a gymnasium.Env",
+            got=f"a {type(env).__name__}",
+            where=function,
+            do="return one environment, such as gymnasium.make(...); vectorised ones are not "
+            "evaluated here",
+        )
+    return env
+
+
+def time_limit(env: gym.Env[Any, Any] | None) -> int | None:
+    """Return the smallest time limit among an environment's wrappers; None: there is none."""
+    limits: list[int] = []
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.wrappers.TimeLimit):
+            limits.append(env._max_episode_steps)
+        env = env.env
+    return min(limits, default=None)
+
+
+def make(env_id: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
     """``gymnasium.make`` for registered ids only.
 
     Gymnasium takes ``module:Name`` for an order to import that module. Ids come from data, and

@@ -22,12 +22,12 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from weighttraj.collect.agents import Agent, actor_parameters
+from weighttraj.collect.environment import describe_env
 from weighttraj.collect.normalizers import Normalizers
 from weighttraj.collect.proof import find_difference
 from weighttraj.format import (
     Algorithm,
     Cadence,
-    EnvInfo,
     ParamLayout,
     PolicySpec,
     Provenance,
@@ -133,7 +133,7 @@ def describe_run(
         run_id=run_id,
         layout=describe_layout(agent.actor, policy),
         policy=policy,
-        env=describe_env(model, norm),
+        env=describe_env(model.env, norm),
         algorithm=describe_algorithm(agent),
         seed=model.seed,
         cadence=describe_cadence(agent, every),
@@ -255,21 +255,6 @@ def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
     return {"head": "other"}, [f"actions in {space}"]
 
 
-def describe_env(model: BaseAlgorithm, norm: Normalizers) -> EnvInfo | None:
-    """The environment as Gymnasium's registry knows it; None: it is not registered."""
-    spec = model.env.get_attr("spec", indices=[0])[0] if model.env is not None else None
-    if spec is None:
-        return None
-    return EnvInfo(
-        id=spec.id,
-        kwargs=_plain(spec.kwargs),
-        max_episode_steps=spec.max_episode_steps,
-        spec={"entry_point": str(spec.entry_point), "reward_threshold": spec.reward_threshold},
-        wrappers=norm.wrappers,
-        cannot_remake=tuple(f"environment wrapper {n}" for n in (*norm.unknown, *norm.rewarding)),
-    )
-
-
 def describe_algorithm(agent: Agent, collector: str = "") -> Algorithm:
     """Name and hyper-parameters; schedules become tables over the progress that remains.
 
@@ -372,8 +357,8 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, np.generic):
         return _plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return str(value)
+    if isinstance(value, float) and np.isnan(value):
+        return "nan"
     if value is None or isinstance(value, bool | int | float | str):
         return value
     return getattr(value, "__qualname__", type(value).__qualname__)

@@ -184,12 +184,13 @@ def _has_array_stats(wrapper: VecNormalize) -> bool:
 
 
 def _vec_obs(wrapper: VecNormalize) -> tuple[ObsNorm, Callable[[], Any]]:
+    clips = np.isfinite(wrapper.clip_obs)  # an infinite bound clips nothing
     spec = ObsNorm(
         source="stable_baselines3.VecNormalize",
         epsilon=wrapper.epsilon,
         shape=tuple(wrapper.observation_space.shape or ()),
-        clip_low=-wrapper.clip_obs,
-        clip_high=wrapper.clip_obs,
+        clip_low=-wrapper.clip_obs if clips else None,
+        clip_high=wrapper.clip_obs if clips else None,
         cast_before_clip=False,
     )
     return spec, lambda: wrapper.obs_rms
@@ -200,15 +201,14 @@ def _gymnasium_obs(
 ) -> tuple[ObsNorm, Callable[[], Any]]:
     outside = chain[: chain.index(wrapper)]
     bounds = [b for w in outside if (b := _clip_bounds(w)) is not None]
-    low, high = (
-        (None, None) if not bounds else (max(b[0] for b in bounds), min(b[1] for b in bounds))
-    )
+    low = max((b[0] for b in bounds), default=-np.inf)
+    high = min((b[1] for b in bounds), default=np.inf)
     spec = ObsNorm(
         source="gymnasium.NormalizeObservation",
         epsilon=wrapper.epsilon,
         shape=tuple(wrapper.obs_rms.mean.shape),
-        clip_low=low,
-        clip_high=high,
+        clip_low=low if np.isfinite(low) else None,
+        clip_high=high if np.isfinite(high) else None,
         dtype=str(wrapper.obs_rms.mean.dtype),
     )
     return spec, lambda: wrapper.obs_rms

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
 from weighttraj.errors import FormatError, NewerFormatError
+from weighttraj.format.exact import decode, encode, encode_exactly
 from weighttraj.format.layout import ParamLayout
 
 FORMAT_VERSION = 1
@@ -85,15 +86,16 @@ class EnvInfo:
     id: str
     """Id for ``gymnasium.make``."""
     kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments for ``gymnasium.make``."""
+    """Keyword arguments for ``gymnasium.make``, with the very values of the training."""
     max_episode_steps: int | None = None
-    """Time limit: an episode has at most this many steps."""
+    """Time limit: an episode has at most this many steps. None: the registered limit; -1: none."""
     spec: dict[str, Any] = field(default_factory=dict)
     """What else the registry says of it, for the record; nothing is rebuilt from it."""
     wrappers: tuple[str, ...] = ()
     """Class names of the wrappers, outermost first."""
     cannot_remake: tuple[str, ...] = ()
-    """Reasons why the environment cannot be made again from this description; empty: it can."""
+    """Reasons why ``gymnasium.make`` gives another environment than the training's, such as
+    "keyword `reward` (function)"; empty: none is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -416,7 +418,7 @@ T = TypeVar("T", RunInfo, DatasetInfo)
 
 
 def parse(document: object, kind: type[T], where: object) -> T:
-    """Parse JSON metadata.
+    """Parse JSON metadata; tagged numbers and tuples (see ``exact``) become what they stand for.
 
     Raises:
         NewerFormatError: a later version of the format wrote it.
@@ -432,7 +434,7 @@ def parse(document: object, kind: type[T], where: object) -> T:
             do="pip install --upgrade weighttraj",
         )
     try:
-        return msgspec.convert(document, kind)
+        return msgspec.convert(decode(document), kind)
     except msgspec.ValidationError as error:
         raise FormatError(
             f"the metadata is not a valid {kind.__name__}",
@@ -483,22 +485,16 @@ def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def to_json(info: RunInfo | DatasetInfo) -> dict[str, Any]:
-    """Plain JSON values of the metadata.
+    """Return the metadata as plain JSON values.
 
     Raises:
-        FormatError: it holds a value that JSON cannot.
+        FormatError: it holds a value that JSON cannot; the error names the field.
     """
-    try:
-        # Not msgspec: it leaves out fields that it filled with defaults when it parsed.
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(info), allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise FormatError(
-            "the metadata holds a value that JSON cannot",
-            expected="finite numbers, strings, booleans, None, lists and dicts of them",
-            got=error,
-            do="describe the value by plain data",
-        ) from error
-    return plain
+    # Not msgspec: it leaves out fields that it filled with defaults when it parsed.
+    document: dict[str, Any] = encode(info)
+    if isinstance(info, RunInfo) and info.env is not None:
+        document["env"]["kwargs"] = encode_exactly(info.env.kwargs, "env.kwargs")
+    return document
 
 
 def check_id(value: str, what: str) -> str:

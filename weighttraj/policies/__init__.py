@@ -11,10 +11,11 @@ except ModuleNotFoundError as error:
     raise missing_extra(str(error.name), "sb3") from error
 
 from weighttraj.policies.batch import PolicyBatch, load_policies
+from weighttraj.policies.evaluation import evaluate
 from weighttraj.policies.export import SB3Export, export_sb3
 from weighttraj.policies.policy import Policy, load_policy
 from weighttraj.policies.returns import ReturnsConfig, fill_returns
-from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of, evaluate
+from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 
 __all__ = [
     "EpisodeReturns",

@@ -110,11 +110,13 @@ def _spaces(run: Run) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     try:
         if info is None:
             return recorded
-        env = environments.make(info.id, **env_of(run).kwargs)
-    except (CollectError, PolicyError):  # not registered here, or made from files
+        env = environments.remake(env_of(run))
+    except (CollectError, PolicyError):  # not registered here, or it cannot be made again
         return recorded
     observation, action = env.observation_space, env.action_space
     env.close()
+    if isinstance(recorded[1], spaces.Box) and not recorded[1].is_bounded():
+        action = recorded[1]  # a wrapper of the training clips actions
     same_action = type(action) is type(recorded[1]) and action == _cast(recorded[1], action)
     if observation.shape != recorded[0].shape or not same_action:
         raise PolicyError(

@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
+import math
 import os
+import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +45,9 @@ from weighttraj.progress import LoggedProgress
 from weighttraj.remote.address import here
 
 Mode = Literal["deterministic", "sampled"]
+
+_TELL_EVERY = 0.5
+"""Seconds."""
 
 BLOCK = 32
 """Snapshots that are played, and written to the journal, at a time."""
@@ -392,13 +397,27 @@ def play_rows(task: _Task, tell: Tell) -> EpisodeReturns:
     """Returns and lengths (snapshot, episode) of some snapshots, both modes side by side."""
     run, config = open_run(task.path), task.config
     policies = load_policies(run, task.rows)
+    tick = _seldom(tell)  # it may be time to stop
     with Evaluator(env_of(run), episodes=config.episodes, seed=config.seed) as evaluator:
-        played = []
-        for mode in config.modes:
-            tell()  # it may be time to stop
-            played.append(evaluator(policies, deterministic=mode == "deterministic"))
+        played = [
+            evaluator(policies, deterministic=mode == "deterministic", tick=tick)
+            for mode in config.modes
+        ]
     returns, lengths = (np.concatenate(parts, axis=1) for parts in zip(*played, strict=True))
     return EpisodeReturns(returns, lengths)
+
+
+def _seldom(tell: Tell) -> Callable[[], None]:
+    """Return a function that calls ``tell`` at most every half second: it may be a message."""
+    told = -math.inf
+
+    def tick() -> None:
+        nonlocal told
+        if time.monotonic() - told > _TELL_EVERY:
+            told = time.monotonic()
+            tell()
+
+    return tick
 
 
 @contextlib.contextmanager

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import queue
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from threading import Event
 from types import TracebackType
 from typing import Any, NamedTuple, overload
 
@@ -16,15 +16,19 @@ from weighttraj import environments
 from weighttraj.errors import PolicyError
 from weighttraj.format import EnvInfo, PolicySpec, Run
 from weighttraj.policies.batch import PolicyBatch
+from weighttraj.policies.ending import check_numbers, end_of
 from weighttraj.policies.policy import Policy
 from weighttraj.policies.simulators import Simulator, make_simulator
-from weighttraj.threads import one_torch_thread
+from weighttraj.threads import in_threads, one_torch_thread
 
 _BLOCK = 256
 """Policies that play at once: enough for the physics to outweigh Python."""
 
 _NOISE_STEPS = 256
 """Steps for which the noise of actions is drawn at a time."""
+
+
+Tick = Callable[[], None]
 
 
 class EpisodeReturns(NamedTuple):
@@ -43,42 +47,42 @@ class Evaluator:
     own, so all policies meet the same starts and the same noise. A policy's returns do not depend
     on the policies beside it, nor on the number of threads. (The number of episodes may move the
     last bit of an action: matrix products are ordered by their size.) Raw observations and rewards:
-    policies bring their normalisers.
+    policies bring their normalisers. Actions are clipped to the environment's bounds, too.
 
     Gymnasium's planar MuJoCo environments run as batched physics (``mujoco.batch``), bit by bit as
     Gymnasium steps them. Any other environment runs in Gymnasium's own loop, 5 to 20 times slower;
     ``simulator`` says which it is.
 
     Args:
-        env: the environment, as a run describes it.
+        env: the environment, as a run describes it; or a function that makes one.
         episodes: number of episodes.
         seed: of the first episode.
         threads: that play; each has policies of its own.
         block: policies that play at once; memory grows with it.
+        max_steps: cut episodes off after so many steps. None: the environment's own time limit;
+            without one, an episode of ``ENDLESS`` steps is an error.
 
     Raises:
         CollectError: the environment is not registered here.
-        PolicyError: fewer than one episode.
+        PolicyError: fewer than one episode, or the environment cannot be made again.
     """
 
     def __init__(
         self,
-        env: EnvInfo,
+        env: EnvInfo | Callable[[], gym.Env[Any, Any]],
         *,
         episodes: int = 20,
         seed: int = 0,
         threads: int = 1,
         block: int = _BLOCK,
+        max_steps: int | None = None,
     ) -> None:
-        if min(episodes, threads, block) < 1:
-            raise PolicyError(
-                "no episodes to play, or nothing to play them with",
-                expected="episodes, threads and block at least 1",
-                got=f"episodes {episodes}, threads {threads}, block {block}",
-            )
+        check_numbers(episodes=episodes, threads=threads, block=block, max_steps=max_steps)
         self.seeds = list(range(seed, seed + episodes))
-        self._info, self._threads, self._block = env, threads, block
+        self._source, self._threads, self._block = env, threads, block
+        self._info = env if isinstance(env, EnvInfo) else EnvInfo(id=getattr(env, "__name__", "-"))
         self._env = self._make()
+        self._end = end_of(self._env, max_steps)
         self._noise: dict[tuple[str, int], list[np.ndarray]] = {}
         self._drawing = threading.Lock()
 
@@ -88,49 +92,49 @@ class Evaluator:
         return self._simulators[0].name
 
     @overload
-    def __call__(self, policy: Policy, *, deterministic: bool = True) -> EpisodeReturns: ...
-    @overload
-    def __call__(self, policy: PolicyBatch, *, deterministic: bool = True) -> EpisodeReturns: ...
     def __call__(
-        self, policy: Policy | PolicyBatch, *, deterministic: bool = True
+        self, policy: Policy, *, deterministic: bool = True, tick: Tick = ...
+    ) -> EpisodeReturns: ...
+    @overload
+    def __call__(
+        self, policy: PolicyBatch, *, deterministic: bool = True, tick: Tick = ...
+    ) -> EpisodeReturns: ...
+    def __call__(
+        self,
+        policy: Policy | PolicyBatch,
+        *,
+        deterministic: bool = True,
+        tick: Tick = lambda: None,
     ) -> EpisodeReturns:
         """Play every episode to its end.
 
         Args:
             policy: one policy, or many.
             deterministic: act by the distribution's mode, else by samples.
+            tick: called in this thread every now and then; what it raises stops the episodes.
 
         Returns:
             Returns and lengths, (policy, episode); of a single policy (episode,).
 
         Raises:
-            PolicyError: the policy's observations or actions are not the environment's.
+            PolicyError: the policy's observations or actions are not the environment's, or an
+                episode has no end.
+            KeyboardInterrupt: it was stopped; no further step is taken.
         """
         _check_spaces(policy.spec, self._env)
         if isinstance(policy, Policy):
-            returns, lengths = self(_batch_of(policy), deterministic=deterministic)
+            returns, lengths = self(_batch_of(policy), deterministic=deterministic, tick=tick)
             return EpisodeReturns(returns[0], lengths[0])
         size = self._size(len(policy))
         blocks = [policy[start : start + size] for start in range(0, len(policy), size)]
-        free: queue.SimpleQueue[Simulator] = queue.SimpleQueue()  # simulators that no thread uses
-        for simulator in self._simulators:
-            free.put(simulator)
 
-        def play(block: PolicyBatch) -> EpisodeReturns:
-            simulator = free.get()
-            try:
-                return self._play(simulator, block, deterministic)
-            finally:
-                free.put(simulator)
+        def play(simulator: Simulator, block: PolicyBatch, stop: Event) -> EpisodeReturns:
+            return self._play(simulator, block, deterministic, stop)
 
         # Torch's own threads would wait for their next piece in a loop, and take the time of the
         # physics: each thread of ours plays a block with one.
-        with (
-            one_torch_thread(),
-            environments.quiet_mujoco(),
-            ThreadPoolExecutor(len(self._simulators)) as pool,
-        ):
-            played = list(pool.map(play, blocks))
+        with one_torch_thread(), environments.quiet_mujoco():
+            played = in_threads(play, self._simulators, blocks, tick)
         returns, lengths = (np.concatenate(x) for x in zip(*played, strict=True))
         return EpisodeReturns(returns, lengths)
 
@@ -154,9 +158,10 @@ class Evaluator:
     @cached_property
     def _simulators(self) -> list[Simulator]:
         """One a thread; Gymnasium's loop is Python, which has one thread."""
-        first = make_simulator(self._make, self.seeds)
-        others = self._threads - 1 if first.most is None else 0
-        return [first, *(make_simulator(self._make, self.seeds) for _ in range(others))]
+        with environments.explained(self._info):
+            first = make_simulator(self._make, self.seeds)
+            others = self._threads - 1 if first.most is None else 0
+            return [first, *(make_simulator(self._make, self.seeds) for _ in range(others))]
 
     def _size(self, policies: int) -> int:
         """Policies that a thread plays at once."""
@@ -164,37 +169,47 @@ class Evaluator:
         return max(1, -(-min(most, policies) // len(self._simulators)))
 
     def _make(self) -> gym.Env[Any, Any]:
-        limit = self._info.max_episode_steps
-        limits = {} if limit is None else {"max_episode_steps": limit}
-        return environments.make(self._info.id, **limits, **self._info.kwargs)
+        if isinstance(self._source, EnvInfo):
+            return environments.remake(self._source)
+        return environments.made_by(self._source)
 
     def _play(
-        self, simulator: Simulator, policies: PolicyBatch, deterministic: bool
+        self, simulator: Simulator, policies: PolicyBatch, deterministic: bool, stop: Event
     ) -> EpisodeReturns:
         """Returns and lengths (policy, episode) of a block of policies."""
         shape = (len(policies), len(self.seeds))
         returns, lengths = np.zeros(shape), np.zeros(shape, np.int64)
-        first = simulator.reset(len(policies))
+        with environments.explained(self._info):
+            first = simulator.reset(len(policies))
         observations = first.reshape(*shape, *first.shape[1:])
         sims = np.arange(returns.size).reshape(shape)
         running = np.ones(shape, bool)
-        limit = getattr(self._env.spec, "max_episode_steps", None)
         step = 0
-        while running.any() and step != limit:
+        while running.any() and not self._end.cuts(step):
+            if stop.is_set():
+                raise KeyboardInterrupt
             if 2 * running.any(1).sum() <= len(policies):  # policies whose episodes are over leave
                 keep = np.flatnonzero(running.any(1))
                 policies = policies[keep]
                 observations, sims, running = observations[keep], sims[keep], running[keep]
             noise = None if deterministic else self._noise_at(step, policies.spec)
-            actions = policies.act(observations, noise)
+            actions = self._within_bounds(policies.act(observations, noise))
             playing = sims[running]
-            result = simulator.step(playing, actions[running])
+            with environments.explained(self._info):
+                result = simulator.step(playing, actions[running])
             step += 1
             observations[running] = result.observations
             returns.flat[playing] += np.where(result.unstable, np.nan, result.rewards)
             lengths.flat[playing] = step
             running[running] = ~(result.terminated | result.truncated | result.unstable)
         return EpisodeReturns(returns, lengths)
+
+    def _within_bounds(self, actions: np.ndarray) -> np.ndarray:
+        """Clip actions as ``ClipAction`` does, which trainings have and evaluations have not."""
+        space = self._env.action_space
+        if not isinstance(space, gym.spaces.Box):
+            return actions
+        return actions.clip(space.low.astype(actions.dtype), space.high.astype(actions.dtype))
 
     def _noise_at(self, step: int, spec: PolicySpec) -> np.ndarray:
         """What chance adds to the actions of a step, (episode, ...): the same for all policies."""
@@ -217,67 +232,55 @@ class Evaluator:
         return np.asarray(generator.random(shape)[part])
 
 
-def evaluate(
-    policy: Policy | PolicyBatch,
-    env: EnvInfo | Run | str,
-    *,
-    episodes: int = 20,
-    seed: int = 0,
-    deterministic: bool = True,
-    threads: int = 1,
-) -> EpisodeReturns:
-    """Returns of a policy, or of many, over fixed episode seeds.
-
-    Args:
-        policy: from ``run.load_policy(t)``, or ``load_policies(run, rows)``.
-        env: the environment, its id, or a run that was trained in it.
-        episodes: number of episodes.
-        seed: of the first episode; episode i starts from ``seed + i``.
-        deterministic: act by the distribution's mode, else by samples.
-        threads: for physics and networks.
-
-    Raises:
-        CollectError: the environment is not registered here.
-        PolicyError: the run does not say which environment it was trained in.
-    """
-    if isinstance(env, Run):
-        env = env_of(env)
-    elif isinstance(env, str):
-        env = EnvInfo(id=env)
-    with Evaluator(env, episodes=episodes, seed=seed, threads=threads) as evaluator:
-        return evaluator(policy, deterministic=deterministic)
-
-
 def env_of(run: Run) -> EnvInfo:
-    """The environment of a run.
+    """Return the environment of a run.
 
     Raises:
-        PolicyError: the run does not say, the environment cannot be made again, or it is made from
-            files: those that a data set names are not to be opened.
+        PolicyError: the run does not say, or names files: those of a data set are not to be opened;
+            or an earlier version wrote text in place of a keyword.
     """
     if run.info.env is None:
         raise PolicyError(
             "the run does not say which environment it was trained in",
             where=run.path,
-            do="pass weighttraj.format.EnvInfo(id=...) instead of the run",
+            do="pass weighttraj.format.EnvInfo(id=...), or a function that makes the environment, "
+            "instead of the run",
         )
-    if run.info.env.cannot_remake:
-        raise PolicyError(
-            "the run's environment cannot be made again, so its policies cannot be evaluated in it",
-            expected="an environment that gymnasium.make makes from its id and keywords",
-            got="; ".join(run.info.env.cannot_remake),
-            where=run.path,
-            do="make the environment yourself and act in it with run.load_policy(t)",
-        )
-    paths = [v for v in run.info.env.kwargs.values() if isinstance(v, str) and set(v) & set("/\\")]
-    if paths:
+    texts = {name: list(_texts(value)) for name, value in run.info.env.kwargs.items()}
+    if paths := [text for found in texts.values() for text in found if set(text) & set("/\\")]:
         raise PolicyError(
             "the run's environment is made from files of the machine it was trained on",
             got=paths,
             where=run.path,
             do="if you trust the data, pass run.info.env instead of the run",
         )
+    if lost := [name for name, found in texts.items() if any(map(_stands_for_another, found))]:
+        raise PolicyError(
+            f"this environment cannot be made again: keyword `{lost[0]}`",
+            expected="a number or a function, of which an earlier version stored the text only",
+            got=run.info.env.kwargs[lost[0]],
+            where=run.path,
+            do=environments.OWN_ENVIRONMENT,
+        )
     return run.info.env
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield every string in a keyword's value."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            yield from _texts(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _texts(item)
+
+
+def _stands_for_another(text: str) -> bool:
+    """Whether a text is what earlier versions wrote for an infinite number or a function."""
+    return text in ("inf", "-inf", "nan") or "<lambda>" in text or "<locals>" in text
 
 
 def _check_spaces(spec: PolicySpec, env: gym.Env[Any, Any]) -> None:

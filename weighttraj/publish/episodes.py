@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 
 from weighttraj import environments
 from weighttraj.errors import PolicyError
-from weighttraj.format import EnvInfo, Run
+from weighttraj.format import Run
 from weighttraj.policies import Evaluator, Policy, env_of, load_policies
 from weighttraj.publish.curves import Curve, mean_returns, thin
 from weighttraj.publish.scene import Placement, Pose, View, placement_of, pose_of, view_of
@@ -71,7 +71,7 @@ def choose(run: Run, seed: int) -> Moments:
     """
     stored = mean_returns(run, "deterministic")
     known = np.flatnonzero(np.isfinite(stored)) if stored is not None else np.arange(0)
-    with Evaluator(_env_of(run), episodes=PROBE_EPISODES, seed=seed) as evaluator:
+    with Evaluator(env_of(run), episodes=PROBE_EPISODES, seed=seed) as evaluator:
         if stored is not None and len(known) > len(SHARES):
             values, which = stored[known], "the stored return"
         else:
@@ -153,11 +153,8 @@ class Stage:
     """
 
     def __init__(self, run: Run) -> None:
-        info = _env_of(run)
-        arguments = dict(info.kwargs)
-        if info.max_episode_steps is not None:
-            arguments["max_episode_steps"] = info.max_episode_steps
-        self.env: gym.Env[Any, Any] = _make(info.id, arguments)
+        self._info = info = env_of(run)
+        self.env: gym.Env[Any, Any] = environments.remake(info)
         inner: Any = self.env.unwrapped
         self.model, self.data = getattr(inner, "model", None), getattr(inner, "data", None)
         if not (isinstance(self.model, mujoco.MjModel) and isinstance(self.data, mujoco.MjData)):
@@ -188,14 +185,16 @@ class Stage:
             PolicyError: the policy cannot be rebuilt, or does not fit the environment.
         """
         policy = run.load_policy(t)
-        observation, _ = self.env.reset(seed=seed)
+        with environments.explained(self._info):
+            observation, _ = self.env.reset(seed=seed)
         places = [self._placement()]
         rewards: list[float] = []
         terminated = truncated = False
         with one_torch_thread(), environments.quiet_mujoco():
             while not (terminated or truncated) and len(rewards) < MAX_STEPS:
                 action = self._action(policy, observation)
-                observation, reward, terminated, truncated, _ = self.env.step(action)
+                with environments.explained(self._info):
+                    observation, reward, terminated, truncated, _ = self.env.step(action)
                 rewards.append(float(reward))
                 if len(rewards) <= shown:
                     places.append(self._placement())
@@ -225,20 +224,3 @@ class Stage:
                 do="install the version of the environment that run.info.provenance names",
             )
         return action
-
-
-def _env_of(run: Run) -> EnvInfo:
-    """The run's environment, without a window."""
-    info = env_of(run)
-    return replace(info, kwargs={k: v for k, v in info.kwargs.items() if k != "render_mode"})
-
-
-def _make(env_id: str, arguments: dict[str, Any]) -> gym.Env[Any, Any]:
-    try:
-        return environments.make(env_id, **arguments)
-    except (TypeError, ValueError, OSError, AssertionError) as error:  # arguments come from data
-        raise PolicyError(
-            "the environment cannot be made with its recorded arguments",
-            got=f"{env_id}, {arguments}: {error}",
-            do="install the version of the environment that run.info.provenance names",
-        ) from error
