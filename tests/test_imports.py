@@ -20,9 +20,11 @@ ALLOWED = {
     "weighttraj.threads": [],
     "weighttraj.progress": [],
     "weighttraj.terminal": [],
+    "weighttraj.plugins": ["weighttraj.errors"],
     "weighttraj.engine": ["weighttraj.errors", "weighttraj.engine"],
     "weighttraj.engine.choose": [
         "weighttraj.errors",
+        "weighttraj.plugins",
         "weighttraj.engine",
         "later weighttraj.engine.cluster",
     ],
@@ -140,6 +142,7 @@ ALLOWED = {
     "weighttraj.format": [FORMAT],
     "weighttraj.environments": ["weighttraj.errors", FORMAT],
     "weighttraj.collect": [
+        "weighttraj.plugins",
         "weighttraj.progress",
         "weighttraj.threads",
         "weighttraj.engine",
@@ -263,6 +266,7 @@ ALLOWED = {
         "door weighttraj",
         "weighttraj.errors",
         "weighttraj.format.locate",
+        "weighttraj.plugins",
         "weighttraj.registry",
         "weighttraj.remote",
         "weighttraj.terminal",

@@ -134,6 +134,8 @@ class _Evaluate(EvaluateConfig):
     ``ema-0.95``, say."""
     workers: int = 1
     """Processes, each with one thread; each takes a run at a time."""
+    imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
+    """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
 
 @app.command(name="evaluate")
@@ -144,7 +146,9 @@ def _evaluate(args: _Evaluate) -> None:
     config = EvaluateConfig(
         **{field.name: getattr(args, field.name) for field in fields(EvaluateConfig)}
     )
-    results = tipl.evaluate(forecasters, config, workers=args.workers, console=console)
+    results = tipl.evaluate(
+        forecasters, config, workers=args.workers, imports=args.imports, console=console
+    )
     console.print(_table(results))
     print(report.verdict(results))
     print(f"report: {config.out / 'report.html'}")

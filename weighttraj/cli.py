@@ -18,8 +18,12 @@ import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import RegistryError, WeightTrajError
 from weighttraj.format.locate import COLLECTED, clone, locate
+from weighttraj.plugins import import_modules
 from weighttraj.remote import is_remote
 from weighttraj.terminal import Output, while_read
+
+Imports = Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")]
+"""Modules that register environments, of the option --import."""
 
 app = tyro.extras.SubcommandApp()
 console = Output()
@@ -39,6 +43,8 @@ class _Collect:
     """Processes, each with one thread, that train a run, or a population, at a time."""
     scheduler: str | None = None
     """Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this machine."""
+    imports: Imports = ()
+    """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
 
 @app.command(name="collect")
@@ -56,6 +62,7 @@ def _collect(args: _Collect) -> None:
         seeds=seeds,
         workers=args.workers,
         scheduler=args.scheduler,
+        imports=args.imports,
         console=console,
     )
     print(dataset)
@@ -83,6 +90,8 @@ class _Returns:
     """Processes, each with one thread."""
     scheduler: str | None = None
     """Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this machine."""
+    imports: Imports = ()
+    """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
     replace: bool = False
     """Evaluate anew what has returns of other episodes or other versions of the physics."""
 
@@ -104,6 +113,7 @@ def _returns(args: _Returns) -> None:
         config,
         workers=args.workers,
         scheduler=args.scheduler,
+        imports=args.imports,
         replace=args.replace,
         console=console,
     )
@@ -335,12 +345,15 @@ class _Verify:
     """Train so many snapshots of a run again and compare them."""
     seed: int | None = None
     """Which run is trained again. Default: the first."""
+    imports: Imports = ()
+    """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
 
 @app.command(name="verify")
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _verify(args: _Verify) -> None:
     """Is it whole? Exit with 1 if something is missing, damaged or not what it says."""
+    import_modules(args.imports)
     path = locate(args.path)
     problems = wt.verify(path, deep=args.deep, console=console)
     if args.replay and not problems:
@@ -411,12 +424,15 @@ class _Report:
     """Of the film's episodes."""
     overwrite: bool = False
     """Replace the file, whatever it is."""
+    imports: Imports = ()
+    """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
 
 @app.command(name="report")
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _report(args: _Report) -> None:
     """Write a page that shows what a data set or a run holds: returns, steps, spectrum, film."""
+    import_modules(args.imports)
     if args.all:
         _gallery(args)
         return

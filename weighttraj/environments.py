@@ -139,8 +139,9 @@ def make(env_id: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
             "the environment cannot be made",
             expected="an id in gymnasium's registry, such as InvertedPendulum-v4",
             got=f"{env_id!r}: {error}",
-            do="print the ids with gymnasium.pprint_registry(), or import the package that "
-            "registers yours; MuJoCo's come with pip install 'weighttraj[sb3]'",
+            do="print the ids with gymnasium.pprint_registry(), or import the module that "
+            "registers yours (--import MODULE on the command line); MuJoCo's come with "
+            "pip install 'weighttraj[sb3]'",
         ) from error
 
 

@@ -290,8 +290,8 @@ def test_actions_behind_a_clip_are_stored_unbounded_and_played_within_bounds(
 
     gym.register("Costly-v0", Costly)
     env = gym.wrappers.ClipAction(gym.make("Costly-v0"))
-    network = torch.nn.Linear(2, 1)
-    torch.nn.init.constant_(network.bias, 10.0)  # far outside
+    network = torch.nn.Sequential(torch.nn.Linear(2, 1))
+    torch.nn.init.constant_(network[0].bias, 10.0)  # far outside
     layout, policy = describe_mlp(network, env.observation_space, env.action_space)
     info = wt.RunInfo(
         run_id="run", layout=layout, policy=policy, env=wt.format.EnvInfo(id="Costly-v0")

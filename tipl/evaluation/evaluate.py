@@ -23,7 +23,7 @@ from tipl.evaluation.starts import starts_of
 from tipl.evaluation.summary import Summary
 from tipl.forecast import TIPL, Forecaster
 from tipl.report import write_report
-from weighttraj.engine import engine_of
+from weighttraj.engine import Engine, engine_of
 from weighttraj.progress import LoggedProgress
 
 
@@ -32,6 +32,7 @@ def evaluate(
     config: EvaluateConfig,
     *,
     workers: int = 1,
+    imports: Sequence[str] = (),
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Judge forecasters beside the copy of the last weights; writes results and a page.
@@ -43,6 +44,7 @@ def evaluate(
         forecasters: who is judged; the copy is added, and the floor of each TIPL's rank.
         config: on what, and how much.
         workers: processes; 1 means this one.
+        imports: modules that register environments; every worker imports them.
         console: where progress is shown; None: nowhere.
 
     Returns:
@@ -69,7 +71,8 @@ def evaluate(
     _check_names(everyone)
     tasks = [Task(path=run.path.absolute(), forecasters=everyone, config=config) for run in runs]
     starts_of(runs[0], config)  # too short, or no returns: said before hours of work
-    measured = _measure(tasks, workers, console or Console(quiet=True))
+    with engine_of(workers, imports=imports) as engine:
+        measured = _measure(tasks, engine, console or Console(quiet=True))
     summary = Summary(measured, config, copy.name)
     results = {
         "data": dataset.info.id,
@@ -155,7 +158,7 @@ def _check_names(forecasters: Sequence[Forecaster]) -> None:
         )
 
 
-def _measure(tasks: Sequence[Task], workers: int, console: Console) -> list[Measured]:
+def _measure(tasks: Sequence[Task], engine: Engine, console: Console) -> list[Measured]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -163,7 +166,7 @@ def _measure(tasks: Sequence[Task], workers: int, console: Console) -> list[Meas
         TimeRemainingColumn(),
     )
     measured: dict[wt.Place, Measured] = {}
-    with LoggedProgress(*columns, console=console) as progress, engine_of(workers) as engine:
+    with LoggedProgress(*columns, console=console) as progress:
         bars = {
             what: progress.add_task(what, total=total)
             for what, total in _totals(tasks).items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -24,6 +24,7 @@ from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_data
 from weighttraj.format.catalog import MANIFEST, read_dataset_info, write_dataset_info
 from weighttraj.format.integrity import seal
 from weighttraj.format.storage import PACKED, read_info
+from weighttraj.plugins import import_modules
 from weighttraj.progress import LoggedProgress
 
 
@@ -34,6 +35,7 @@ def collect(
     seeds: list[int] | None = None,
     workers: int = 1,
     scheduler: str | None = None,
+    imports: Sequence[str] = (),
     console: Console | None = None,
 ) -> Dataset:
     """Collect the runs of a recipe that do not exist yet.
@@ -49,6 +51,7 @@ def collect(
         workers: processes; 1 means this one. Each trains one run at a time, or a population.
         scheduler: address of a Dask scheduler whose workers do it instead, or ``local``; see
             ``weighttraj.engine``. The bytes are the same.
+        imports: modules that register environments; every worker imports them.
         console: where progress is shown; None: nowhere.
 
     Raises:
@@ -58,6 +61,7 @@ def collect(
         RecipeError: there can be no such runs, or none are asked for.
         KeyboardInterrupt: it was stopped; what was committed stays.
     """
+    import_modules(imports)
     recipe.check()
     wanted = set(recipe.splits() if seeds is None else seeds)
     if not wanted:
@@ -71,7 +75,10 @@ def collect(
     out = Path(out).absolute()
     console = console or Console(quiet=True)
     # The engine is closed first: then the seconds of its processes are known.
-    with measured(out, lambda: _packed_seeds(out)), engine_of(workers, scheduler) as engine:
+    with (
+        measured(out, lambda: _packed_seeds(out)),
+        engine_of(workers, scheduler, imports) as engine,
+    ):
         out.mkdir(parents=True, exist_ok=True)
         with _lock(out, console):
             info = _prepare(recipe, out, seeds)

@@ -119,6 +119,7 @@ def fill_returns(
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    imports: Sequence[str] = (),
     replace: bool = False,
     console: Console | None = None,
 ) -> Dataset:
@@ -133,6 +134,7 @@ def fill_returns(
         workers: processes; 1 means this one.
         scheduler: address of a Dask scheduler whose workers do it instead, or ``local``; see
             ``weighttraj.engine``.
+        imports: modules that register environments; every worker imports them.
         replace: drop returns of another evaluation (other episodes, versions of the physics).
         console: where progress is shown; None: nowhere.
 
@@ -149,7 +151,7 @@ def fill_returns(
     path, config = here(path).absolute(), config or ReturnsConfig()
     console = console or Console(quiet=True)
     read_dataset_info(path)  # before a lock is put beside it: is there one?
-    with engine_of(workers, scheduler) as engine, _only_one(path.resolve()):
+    with engine_of(workers, scheduler, imports) as engine, _only_one(path.resolve()):
         runs = _finished(open_dataset(path), console)
         works = [_Work(run, path / ".returns", config, replace=replace) for run in runs]
         works = [work for work in works if work.missing or work.unsaved]
