@@ -35,7 +35,12 @@ ALLOWED = {
     ],
     "weighttraj.format.values": ["weighttraj.errors"],
     "weighttraj.format.layout": ["weighttraj.errors", "weighttraj.format.values"],
-    "weighttraj.format.schema": ["weighttraj.errors", "weighttraj.format.layout"],
+    "weighttraj.format.exact": ["weighttraj.errors"],
+    "weighttraj.format.schema": [
+        "weighttraj.errors",
+        "weighttraj.format.exact",
+        "weighttraj.format.layout",
+    ],
     "weighttraj.format.objects": ["weighttraj.errors", "weighttraj.remote.address"],
     "weighttraj.format.remote": [
         "weighttraj.errors",
