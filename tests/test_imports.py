@@ -270,6 +270,7 @@ ALLOWED = {
     "weighttraj.cli": [
         "door weighttraj",
         "weighttraj.errors",
+        "weighttraj.format.lint",
         "weighttraj.format.locate",
         "weighttraj.plugins",
         "weighttraj.registry",

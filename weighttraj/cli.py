@@ -17,6 +17,7 @@ from rich.table import Table
 import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import RegistryError, WeightTrajError
+from weighttraj.format.lint import lint_returns
 from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.plugins import import_modules
 from weighttraj.remote import is_remote
@@ -120,6 +121,8 @@ def _returns(args: _Returns) -> None:
     for run in dataset:
         if run.evaluation is not None:
             print(f"{run.id}: mean return of the last snapshot {_last_return(run)}")
+        for finding in lint_returns(run):
+            errors.print(f"[yellow]look:[/yellow] {escape(str(finding))}")
 
 
 def _last_return(run: wt.Run) -> str:

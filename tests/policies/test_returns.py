@@ -16,16 +16,20 @@ import numpy as np
 import pytest
 from filelock import FileLock
 from rich.console import Console
+from stable_baselines3 import PPO
 
 import weighttraj as wt
 from tipl.checks import run_like
+from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.engine import Tell
 from weighttraj.errors import EngineError, FormatError, PolicyError, StoreLockedError
 from weighttraj.format import RunEntry
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.format.lint import lint_returns
 from weighttraj.learning import learning_phase
 from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
 from weighttraj.policies.returns import play_rows
+from weighttraj.registry import create
 
 CONFIG = ReturnsConfig(episodes=2, every=20, first=3)
 ROWS = [0, 1, 2, 20, 40, 48]
@@ -340,3 +344,27 @@ def test_the_learning_phase_of_each_run_is_evaluated_densely(dataset: Path) -> N
     before = stored(dataset)
     fill_returns(dataset, replace(CONFIG, first=0, learning=2))
     assert stored(dataset) == before
+
+
+@pytest.mark.parametrize(("learning_rate", "found"), [(1e-7, ["returns"]), (0.03, [])])
+def test_sampled_returns_that_tell_nothing_apart_are_found(
+    learning_rate: float, found: list[str], tmp_path: Path
+) -> None:
+    model = PPO(
+        "MlpPolicy",
+        "CartPole-v1",
+        learning_rate=learning_rate,
+        n_steps=64,
+        batch_size=32,
+        n_epochs=2,
+        seed=0,
+        device="cpu",
+    )
+    path = tmp_path / "run.zarr"
+    model.learn(128, callback=WeightTrajectoryCallback(path, every=2, probe_observations=0))
+    create([path], tmp_path / "data")
+    (run,) = fill_returns(tmp_path / "data", ReturnsConfig(episodes=5, every=1)).runs
+    sampled = run.returns[:, 5:]
+    assert (sampled == sampled[0]).all() == bool(found)
+    assert [finding.check for finding in lint_returns(run)] == found
+    assert ("returns" in {finding.check for finding in wt.lint(tmp_path / "data")}) == bool(found)

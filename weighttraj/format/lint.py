@@ -44,8 +44,9 @@ def lint(path: str | Path, *, console: Console | None = None) -> list[Finding]:
     not follow the cadence), ``order`` (counters that go back), ``jump`` (a step far longer than
     those around it), ``finite``, ``constant`` (parameters that never change), ``normalizer`` (an
     agent without recorded normaliser), ``start`` (a run that begins with a trained policy of
-    unknown origin, or a data set that trains on a run and tests on its continuation), ``short``
-    (fewer snapshots than the other runs have), ``twin`` (runs with the same weights).
+    unknown origin, or a data set that trains on a run and tests on its continuation),
+    ``returns`` (sampled returns that are the same for every snapshot), ``short`` (fewer
+    snapshots than the other runs have), ``twin`` (runs with the same weights).
 
     Args:
         path: data set or run.
@@ -66,7 +67,7 @@ def lint_run(run: Run) -> list[Finding]:
     """What is suspicious about one run."""
     if not len(run):
         return [Finding(check="short", run=run.id, message="no snapshots")]
-    checks = (_start, _duplicates, _counters, _weights, _normalizer)
+    checks = (_start, _duplicates, _counters, _weights, _normalizer, _returns)
     found = [finding for check in checks for finding in check(run)]
     return [Finding(check=check, run=run.id, message=message) for check, message in found]
 
@@ -172,6 +173,35 @@ def _continued(runs: Sequence[Run]) -> Iterator[Finding]:
             yield Finding(check="start", run=run.id, message=message)
 
 
+def lint_returns(run: Run) -> list[Finding]:
+    """What is suspicious about the returns of one run."""
+    return [Finding(check=check, run=run.id, message=said) for check, said in _returns(run)]
+
+
+def _returns(run: Run) -> Iterator[tuple[str, str]]:
+    """Find sampled returns that do not tell the snapshots apart.
+
+    All policies meet the same noise, so that small differences between them show. Policies that are
+    close to uniform then take the very same actions.
+    """
+    evaluation = run.info.evaluation
+    if evaluation is None or all(evaluation.deterministic):
+        return
+    sampled = ~np.array(evaluation.deterministic)
+    returns, lengths = run["eval/returns"][:][:, sampled], run["eval/lengths"][:][:, sampled]
+    known = np.isfinite(returns).all(axis=1)
+    returns, lengths = returns[known], lengths[known]
+    if len(returns) < 2 or (returns != returns[0]).any():
+        return
+    if np.ptp(returns) > 0 or np.ptp(lengths) > 0:  # else all reach the same end, as if solved
+        yield (
+            "returns",
+            f"the sampled returns of all {len(returns)} evaluated snapshots are equal, episode by "
+            "episode: under the noise that all policies share they take the same actions, as "
+            "near-uniform policies do; look at deterministic actions, or train for longer",
+        )
+
+
 def _between(runs: Sequence[Run]) -> Iterator[Finding]:
     yield from _continued(runs)
     lengths = defaultdict(list)
@@ -195,4 +225,4 @@ def _some(values: Sequence[object]) -> str:
     return shown if len(values) <= 5 else f"{shown} and {len(values) - 5} more"
 
 
-__all__ = ["Finding", "lint", "lint_run"]
+__all__ = ["Finding", "lint", "lint_returns", "lint_run"]
