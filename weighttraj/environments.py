@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -38,9 +38,14 @@ def remake(info: EnvInfo) -> gym.Env[Any, Any]:
         )
     if info.max_episode_steps is not None:
         arguments["max_episode_steps"] = info.max_episode_steps
+    _refuse_endless_steps(arguments, info)
     with explained(info):
         env = make(info.id, **arguments)
-    _refuse_endless_steps(env, info)
+    try:
+        _refuse_endless_steps(vars(env.unwrapped), info)
+    except PolicyError:
+        env.close()
+        raise
     return env
 
 
@@ -74,13 +79,11 @@ def explained(info: EnvInfo) -> Iterator[None]:
         ) from error
 
 
-def _refuse_endless_steps(env: gym.Env[Any, Any], info: EnvInfo) -> None:
+def _refuse_endless_steps(settings: Mapping[str, Any], info: EnvInfo) -> None:
     """Refuse an environment of which a single step takes for ever, and cannot be interrupted."""
-    counts = [vars(env.unwrapped).get(name) for name in _FRAMES]
-    counts += [info.kwargs.get(name) for name in _FRAMES]
+    counts = [settings.get(name) for name in _FRAMES]
     found = [n for n in counts if isinstance(n, int | float) and not 1 <= n <= _MOST_FRAMES]
     if found:
-        env.close()
         raise PolicyError(
             "the environment simulates too many frames in a step, or none",
             expected=f"a frame skip from 1 to {_MOST_FRAMES:,}",

@@ -26,7 +26,7 @@ Act = Callable[[Any, Any, bool], tuple[Any, Any]]
 
 def evaluate(
     policy: Any,
-    env: EnvInfo | Run | str | Env | Callable[[], Env],
+    env: Any,
     *,
     episodes: int = 20,
     seed: int = 0,
@@ -40,9 +40,9 @@ def evaluate(
         policy: from ``run.load_policy(t)`` or ``load_policies(run, rows)``; or a model or policy of
             Stable-Baselines3, or any object with its ``predict``; or a function from an observation
             to an action. A model with a ``VecNormalize`` gets observations that it normalised.
-        env: the environment: its id, a run that was trained in it, an environment, or a function
-            that makes one. Raw: rewards are counted as it gives them. It is played in as it is, and
-            not closed, if it is an environment.
+        env: the environment: its id, a run that was trained in it, an ``EnvInfo``, a
+            ``gymnasium.Env``, or a function that makes one. Rewards are counted as it gives them.
+            An environment is played in as it is, wrappers included, and is not closed.
         episodes: number of episodes.
         seed: of the first episode; episode i starts from ``reset(seed=seed + i)``.
         deterministic: act by the distribution's mode, else by samples. Functions act as they do.
