@@ -30,6 +30,9 @@ total_timesteps = 64
 n_steps = 32
 batch_size = 32
 n_epochs = 1
+[store]
+every = 1
+probe_observations = 8
 """
 
 
@@ -75,7 +78,7 @@ def test_a_module_that_does_not_help_is_an_error(name: str, message: str, folder
 def test_every_command_that_makes_environments_takes_modules(folder: Path) -> None:
     said = run("weighttraj", "collect", "recipe.toml", "--out", "theirs")
     assert said.returncode == 1
-    assert "--import" in said.stderr
+    assert "--import MODULE" in " ".join(said.stderr.split())
     module = ("--import", "their_environments")
     for command in (
         ("collect", "recipe.toml", "--out", "theirs", "--workers", 2),
