@@ -86,6 +86,7 @@ ALLOWED = {
     ],
     "weighttraj.format.writer": [
         "weighttraj.errors",
+        REMOTE,
         "weighttraj.format.live",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
@@ -237,7 +238,7 @@ ALLOWED = {
         "weighttraj.format.tables",
         "weighttraj.registry.croissant",
     ],
-    "weighttraj.registry.transfer": ["weighttraj.format.catalog"],
+    "weighttraj.registry.transfer": ["weighttraj.format.catalog", "weighttraj.remote"],
     "weighttraj.registry.download": [
         "weighttraj.progress",
         "weighttraj.errors",

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -45,6 +46,8 @@ class FileServer:
     faults: list[tuple[str, Any]] = field(default_factory=list)
     """What to do wrong, once each: a pattern of the path, and a status, ``cut`` or a change."""
     url: str = ""
+    needs: str = ""
+    """The query without which nothing is found."""
 
     def fault(
         self, pattern: str, what: int | str | Callable[[bytes], bytes], times: int = 1
@@ -105,9 +108,10 @@ class Server(http.server.ThreadingHTTPServer):
 
 
 def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> None:
-    path, span = handler.path, handler.headers.get("Range")
-    file, fault = server.folder / path.lstrip("/"), server.take(path)
-    if isinstance(fault, int) or not file.is_file():
+    path, _, query = handler.path.partition("?")
+    span, fault = handler.headers.get("Range"), server.take(path)
+    file = server.folder / urllib.parse.unquote(path).lstrip("/")
+    if isinstance(fault, int) or not file.is_file() or query != server.needs:
         status = fault if isinstance(fault, int) else 404
         server.log.append(Request(handler.command, path, span, 0))
         _head(handler, status, {"Content-Length": "4"})

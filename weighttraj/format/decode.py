@@ -21,6 +21,7 @@ from weighttraj.format.codecs import PLAIN, unshard
 from weighttraj.format.objects import Objects, missing_object
 
 _MISSING = 2**64 - 1
+_OVERHEAD = 1 << 20  # bytes of an object beside its chunks, at most
 
 GROWING = "--------"
 """In place of the crc32c of a chunk that is not full while its run is collected."""
@@ -131,7 +132,8 @@ class RowDecoder:
         self, index: tuple[int, ...], bounds: list[tuple[int, int]]
     ) -> Iterator[tuple[tuple[int, ...], memoryview]]:
         """First element and bytes of each chunk in an object."""
-        content = self._objects.read(self._key(index))
+        decoded = math.prod(self._outer) * self._dtype.itemsize
+        content = self._objects.read(self._key(index), 0, 2 * decoded + _OVERHEAD)
         if content is None:
             raise self._missing(index)
         corner = tuple(i * c for i, c in zip(index, self._outer, strict=True))

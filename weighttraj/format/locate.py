@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from weighttraj.remote.address import RemotePath, is_remote
+from weighttraj.remote.address import Place, here
 
 VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
 """Environment variable: folders that hold data sets, as in PATH."""
@@ -18,7 +18,7 @@ COLLECTED = "data"
 _ID = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,127}/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
-def locate(path: str | Path) -> Path:
+def locate(path: str | Place) -> Path:
     """The path of a data set: the path itself, or where the data set of an id lies.
 
     An id, with a namespace or without, is looked for in the folders of
@@ -31,10 +31,9 @@ def locate(path: str | Path) -> Path:
         RegistryError: it is an address, and what is asked for needs files on this machine.
     """
     name = str(path)
-    if is_remote(name):
-        os.fspath(RemotePath.parse(name))  # raises, and says how to have it here
-    if Path(path).exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
-        return Path(path)
+    path = here(path)
+    if path.exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
+        return path
     places = [folder / name / part for folder in folders() for part in ("", "data")]
     for place in places:
         if (place / "dataset.json").is_file():

@@ -8,7 +8,7 @@ from typing import Any
 from weighttraj.errors import DamageError
 from weighttraj.format.objects import ZipObjects, check_name, replaced
 from weighttraj.remote.address import RemotePath
-from weighttraj.remote.store import Piece, store_at
+from weighttraj.remote.store import MAX_OBJECT, Piece, store_at
 
 TAIL_BYTES = 1 << 16
 """Bytes at the end of a packed run that are fetched first: the directory of 800 objects."""
@@ -65,6 +65,8 @@ class RemoteBlob:
         missing = [span for span in spans if self._find(*span) is None]
         while missing:
             start, stop = missing.pop(0)
+            if stop - start > KEPT_BYTES // 2:
+                return  # asked for when it is read, as far as it is read
             while missing and 0 <= missing[0][0] - stop <= GAP_BYTES:
                 if missing[0][1] - start > KEPT_BYTES // 2:
                     return  # asked for when it is read
@@ -110,7 +112,11 @@ class RemoteFolder:
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """See ``Objects``."""
-        piece = store_at(self.path.root).read(self._name(name))
+        store, limit = store_at(self.path.root), MAX_OBJECT if stop is None else stop
+        if name.endswith("zarr.json"):
+            piece = store.read(self._name(name), limit)
+        else:
+            piece = store.read_large(self._name(name), limit)
         return None if piece is None else piece.content[start:stop]
 
     def exists(self, name: str) -> bool:
