@@ -22,10 +22,16 @@ CREDENTIALS = {"aws_access_key_id": "key", "aws_secret_access_key": "secret"}
 
 
 @pytest.fixture(autouse=True)
-def patient_for_seconds_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A server that is gone is waited for a minute; not here. Downloads go to a test's store."""
-    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "2")
+def a_store_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Downloads go to a test's store."""
+    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "30")
     monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(tmp_path / "store"))
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that is gone is waited for a minute; not here."""
+    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "2")
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ import http.server
 import json
 import re
 import threading
+import time
 import urllib.parse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -55,6 +56,8 @@ class Hub:
     large: dict[str, bytes] = field(default_factory=dict)
     log: list[tuple[str, str]] = field(default_factory=list)
     faults: list[tuple[str, int]] = field(default_factory=list)
+    slow: float = 0
+    """Seconds before each answer."""
 
     def files(self, repository: str, revision: str = "main") -> dict[str, bytes]:
         found = self.repositories[repository]
@@ -102,6 +105,7 @@ class Answer:
 
     def go(self) -> None:
         method = self.handler.command
+        time.sleep(self.hub.slow)
         self.hub.log.append((method, self.path))
         for index, (pattern, status) in enumerate(self.hub.faults):
             if re.search(pattern, self.path):

@@ -35,6 +35,21 @@ class Request:
     sent: int
 
 
+@dataclass(frozen=True)
+class Long:
+    """A fault: the answer is announced to have so many bytes, and has them."""
+
+    size: int
+
+
+@dataclass(frozen=True)
+class Drip:
+    """A fault: the bytes of the answer come a few at a time, with a pause before them."""
+
+    pause: float
+    bytes_at_once: int = 1
+
+
 @dataclass
 class FileServer:
     """A folder over HTTP, with ranges; counts what it is asked, and misbehaves as it is told."""
@@ -50,7 +65,7 @@ class FileServer:
     """The query without which nothing is found."""
 
     def fault(
-        self, pattern: str, what: int | str | Callable[[bytes], bytes], times: int = 1
+        self, pattern: str, what: int | str | Long | Drip | Callable[[bytes], bytes], times: int = 1
     ) -> None:
         self.faults += [(pattern, what)] * times
 
@@ -111,12 +126,10 @@ def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> N
     path, _, query = handler.path.partition("?")
     span, fault = handler.headers.get("Range"), server.take(path)
     file = server.folder / urllib.parse.unquote(path).lstrip("/")
-    if isinstance(fault, int) or not file.is_file() or query != server.needs:
-        status = fault if isinstance(fault, int) else 404
+    found = file.is_file() and query == server.needs
+    if isinstance(fault, int | Long) or not found:
         server.log.append(Request(handler.command, path, span, 0))
-        _head(handler, status, {"Content-Length": "4"})
-        if handler.command == "GET":
-            handler.wfile.write(b"none")
+        _something_else(handler, fault)
         return
     content = file.read_bytes()
     size, start, stop, status = len(content), 0, len(content), 200
@@ -141,9 +154,32 @@ def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> N
         part = part[: len(part) // 2] if fault == "cut" else part
         server.log.append(Request(handler.command, path, span, len(part)))
         with contextlib.suppress(ConnectionError):
-            handler.wfile.write(part)
+            if isinstance(fault, Drip):
+                _drip(handler, part, fault)
+            else:
+                handler.wfile.write(part)
     if fault == "cut":
         handler.close_connection = True
+
+
+def _something_else(handler: http.server.BaseHTTPRequestHandler, fault: Any) -> None:
+    """Answer without looking at the file."""
+    if not isinstance(fault, Long):
+        _head(handler, fault if isinstance(fault, int) else 404, {"Content-Length": "4"})
+        if handler.command == "GET":
+            handler.wfile.write(b"none")
+        return
+    _head(handler, 200, {"Content-Length": str(fault.size)})
+    with contextlib.suppress(ConnectionError):
+        while handler.command == "GET":
+            handler.wfile.write(bytes(1 << 20))
+
+
+def _drip(handler: http.server.BaseHTTPRequestHandler, content: bytes, how: Drip) -> None:
+    for start in range(0, len(content), how.bytes_at_once):
+        time.sleep(how.pause)
+        handler.wfile.write(content[start : start + how.bytes_at_once])
+        handler.wfile.flush()
 
 
 def _head(

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tipl
 import weighttraj as wt
 from tests.remote import servers
 from tests.remote.conftest import Bucket, files_of, objects_of
@@ -392,6 +393,93 @@ def test_a_file_that_is_not_there(large: Path, tmp_path: Path) -> None:
     (tmp_path / "there/tables/runs.parquet").unlink()
     with servers.FileServer(tmp_path) as server, pytest.raises(DamageError, match="not at the"):
         wt.download(f"{server.url}/there", tmp_path / "here")
+
+
+def without(folder: Path, name: str) -> bytes:
+    """Take a file out of a manifest; returns what that was before."""
+    manifest = folder / "MANIFEST.sha256"
+    before = manifest.read_bytes()
+    lines = before.decode().splitlines(keepends=True)
+    manifest.write_text("".join(line for line in lines if name not in line))
+    return before
+
+
+@pytest.mark.parametrize("name", ["runs/seed0001", "dataset.json"])
+@pytest.mark.parametrize("part", [{}, {"runs": ["seed0001"]}])
+def test_a_manifest_that_leaves_out_what_must_be_there(
+    name: str, part: dict[str, list[str]], published: Path, tmp_path: Path
+) -> None:
+    there, here = tmp_path / "there", tmp_path / "here"
+    shutil.copytree(published, there)
+    before = without(there, name)
+    for _ in range(2):
+        with pytest.raises(DamageError, match=f"(?s)leaves out files.*{name}"):
+            wt.download(there.as_uri(), here, **part)
+        assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    (there / "MANIFEST.sha256").write_bytes(before)
+    dataset = wt.download(there.as_uri(), here, **part)
+    assert len(dataset) == (1 if part else 4)
+    assert wt.verify(here, deep=True) == []
+
+
+def test_a_model_without_its_configuration_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEIGHTTRAJ_MODELS_PATH", str(tmp_path / "models"))
+    there = tmp_path / "gate"
+    tipl.push("tipl-gate-inverted-pendulum-v4", there.as_uri())
+    before = without(there, "config.json")
+    with pytest.raises(DamageError, match=r"(?s)leaves out files.*config\.json"):
+        tipl.load(there.as_uri())
+    (there / "MANIFEST.sha256").write_bytes(before)
+    assert tipl.load(there.as_uri()).name == "gate"
+
+
+def test_links_that_lie_in_the_way_are_not_followed(
+    server: servers.FileServer, published: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mine").write_text("mine")
+    for name in (".a.download", ".b.download.lock"):
+        (tmp_path / name).symlink_to(other if name == ".a.download" else other / "mine")
+    for name in ("a", "b"):
+        with pytest.raises(FormatError, match="a link lies where"):
+            wt.download(f"{server.url}/small-v1", tmp_path / name)
+    (tmp_path / ".c.download/runs").mkdir(parents=True)
+    (tmp_path / ".c.download/runs/.seed0000.zarr.zip.part").symlink_to(other / "mine")
+    (tmp_path / ".c.download/tables").symlink_to(other)
+    wt.download(f"{server.url}/small-v1", tmp_path / "c")
+    assert files_of(tmp_path / "c") == files_of(published)
+    assert files_of(other) == {"mine": b"mine"}
+
+
+def test_names_that_no_manifest_holds_are_refused_before_anything_changes(
+    published: Path, tmp_path: Path
+) -> None:
+    for name in ("my notes.txt", "caf\u00e9.md", "-x"):
+        path = tmp_path / f"odd{len(name)}"
+        shutil.copytree(published, path)
+        (path / name).write_text("x")
+        before = files_of(path)
+        for change in (wt.registry.write_card, wt.seal):
+            with pytest.raises(FormatError, match=r"(?s)its manifest cannot hold.*rename the file"):
+                change(path)
+            assert files_of(path) == before
+        (path / name).unlink()
+        assert wt.verify(path) == []
+
+
+def test_a_card_that_is_a_link_is_not_published(published: Path, tmp_path: Path) -> None:
+    path, secret = tmp_path / "linked", tmp_path / "secret"
+    shutil.copytree(published, path)
+    secret.write_text("# my secret\n\n## Citation\n")
+    (path / "README.md").unlink()
+    (path / "README.md").symlink_to(secret)
+    for publish in (wt.registry.write_card, lambda p: wt.upload(p, (tmp_path / "out").as_uri())):
+        with pytest.raises(FormatError, match="refused to read a file"):
+            publish(path)
+    assert not (tmp_path / "out").exists()
 
 
 def test_nothing_is_overwritten(server: servers.FileServer, tmp_path: Path) -> None:

@@ -186,13 +186,14 @@ def test_a_busy_server_is_asked_again(server: servers.FileServer, status: int) -
     assert len(server.log) == 3
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_server_that_stays_busy_is_named(server: servers.FileServer) -> None:
     server.fault("dataset.json", 503, times=1000)
     with pytest.raises(RemoteError, match=r"(?s)cannot be reached.*503.*dataset\.json"):
         wt.open(f"{server.url}/small-v1")
 
 
-@pytest.mark.parametrize("told", ["abc", "", "nan", "inf", "-5", "1e300"])
+@pytest.mark.parametrize("told", ["abc", "", "nan", "inf", "-5", "0", "1e300"])
 def test_a_time_that_is_none_is_refused(
     told: str, server: servers.FileServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,6 +211,7 @@ def test_an_answer_that_breaks_off_is_asked_for_again(
     assert not large_server.faults
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_server_that_dies(large: Path) -> None:
     with servers.FileServer(large.parent) as dying:
         run = wt.open(f"{dying.url}/large-v1").runs[0]
@@ -300,6 +302,7 @@ def test_azure_which_is_asked_for_no_suffixes(
         same(wt.open("az://container/small-v1"), wt.open(published))
 
 
+@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize(("status", "what"), [(403, "access denied"), (503, "cannot be reached")])
 def test_a_run_that_cannot_be_had_is_not_asked_for_in_another_way(
     status: int, what: str, server: servers.FileServer
