@@ -155,6 +155,7 @@ ALLOWED = {
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
+        REMOTE,
         "weighttraj.collect",
         "weighttraj.policies.kernels",
         "weighttraj.policies.policy",
@@ -266,6 +267,7 @@ ALLOWED = {
         "door weighttraj.format",
         "weighttraj.format.catalog",
         "weighttraj.format.locate",
+        "weighttraj.format.objects",
         "weighttraj.remote",
     ],
     "weighttraj.cli": [
@@ -447,7 +449,7 @@ ALLOWED = {
         "tipl.zoo",
         "door weighttraj",
     ],
-    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", "weighttraj.terminal"],
+    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", REMOTE, "weighttraj.terminal"],
     "tipl": ["tipl", "weighttraj.errors"],
 }
 

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import boto3
 import huggingface_hub.constants
+import numpy as np
 import pytest
 
 import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote import servers
+from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo
+from weighttraj.format.catalog import write_dataset_info
 from weighttraj.registry import create
 from weighttraj.remote.store import store_at
 
@@ -40,6 +43,27 @@ def published(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     path = tmp_path_factory.mktemp("published") / "small-v1"
     shutil.copytree(small_dataset, path)
     (path / "README.md").write_text(CARD)
+    wt.seal(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A packed run and one that is a folder, of no training. Do not write to it."""
+    path = tmp_path_factory.mktemp("tiny") / "tiny"
+    entries = (RunEntry(id="a", path="runs/a.zarr.zip"), RunEntry(id="b", path="runs/b.zarr"))
+    layout, rng = ParamLayout.of({"w": ((3,), "other", ("fixed",))}), np.random.default_rng(0)
+    for entry in entries:
+        folder = path / f"runs/{entry.id}.zarr"
+        with wt.RunWriter(folder, RunInfo(run_id=entry.id, layout=layout, block=2)) as writer:
+            for t in range(5):
+                writer.append(rng.normal(size=3).astype(np.float32), num_timesteps=t)
+    wt.pack(path / "runs/a.zarr")
+    shutil.rmtree(path / "runs/a.zarr")
+    for lock in path.rglob("*.lock"):
+        lock.unlink()
+    (path / "README.md").write_text(CARD)
+    write_dataset_info(path, DatasetInfo(id="tiny", runs=entries, status="complete"))
     wt.seal(path)
     return path
 

@@ -17,38 +17,14 @@ import tipl
 import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote import servers
-from tests.remote.conftest import CARD, Bucket, make_bucket
+from tests.remote.conftest import Bucket, make_bucket
 from tests.test_cli import run as shell
 from weighttraj.errors import DamageError, RemoteError
-from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo, RunWriter
-from weighttraj.format.catalog import write_dataset_info
 from weighttraj.remote import RemotePath
 from weighttraj.remote.store import RemoteStore
 from weighttraj.remote.wait import TIMEOUT
 
 GIB = 1 << 30
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set of one packed run and one that is a folder. Do not write to it."""
-    path = tmp_path_factory.mktemp("tiny") / "tiny"
-    entries = (
-        RunEntry(id="a", path="runs/a.zarr.zip", split="train"),
-        RunEntry(id="b", path="runs/b.zarr", split="train"),
-    )
-    layout = ParamLayout.of({"w": ((3,), "other", ("fixed",))})
-    for shift, entry in enumerate(entries):
-        folder = path / f"runs/{entry.id}.zarr"
-        with RunWriter(folder, RunInfo(run_id=entry.id, layout=layout, block=2)) as writer:
-            for t in range(5):
-                writer.append([t + shift, 1, 2], num_timesteps=t)
-    wt.pack(path / "runs/a.zarr")
-    shutil.rmtree(path / "runs/a.zarr")
-    (path / "README.md").write_text(CARD)
-    write_dataset_info(path, DatasetInfo(id="tiny", runs=entries, status="complete"))
-    wt.seal(path)
-    return path
 
 
 @pytest.fixture
@@ -130,10 +106,18 @@ def test_a_large_file_may_take_longer_as_long_as_it_comes(
         assert b"".join(store.pieces("large")) == content
 
 
+def started(*arguments: str) -> subprocess.Popen[bytes]:
+    """A command that Ctrl-C reaches, also where whoever started the tests ignores it."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "weighttraj.cli", *arguments],
+        env=os.environ | {TIMEOUT: "600"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
 def test_ctrl_c_ends_a_command_that_waits_for_a_server(server: servers.FileServer) -> None:
     server.fault("dataset.json", servers.Drip(0.1), times=99)
-    command = [sys.executable, "-m", "weighttraj.cli", "show", f"{server.url}/tiny"]
-    with subprocess.Popen(command, env=os.environ | {TIMEOUT: "600"}) as process:
+    with started("show", f"{server.url}/tiny") as process:
         while not server.log and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
@@ -144,10 +128,8 @@ def test_ctrl_c_ends_a_download_of_several_files(
     server: servers.FileServer, tmp_path: Path
 ) -> None:
     server.fault("runs/", servers.Drip(0.1), times=99)
-    command = ["download", f"{server.url}/tiny", "--out", str(tmp_path / "here")]
-    with subprocess.Popen(
-        [sys.executable, "-m", "weighttraj.cli", *command], env=os.environ | {TIMEOUT: "600"}
-    ) as process:
+    address, out = f"{server.url}/tiny", tmp_path / "here"
+    with started("download", address, "--out", str(out)) as process:
         while not any("runs/" in request.path for request in server.log):
             assert process.poll() is None
             time.sleep(0.01)

@@ -15,7 +15,8 @@ HOME = "~/.weighttraj/datasets"
 COLLECTED = "data"
 """Where data sets are collected, below the working directory."""
 
-_ID = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,127}/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_ID = re.compile(r"([^/\0.][^/\0]{0,199}/)?[^/\0.][^/\0]{0,199}")
+"""What can be an id here: the name of a folder, or of one in another, that is not hidden."""
 
 
 def locate(path: str | Place) -> Path:
