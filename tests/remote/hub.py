@@ -97,7 +97,8 @@ class Answer:
 
     def __init__(self, hub: Hub, handler: http.server.BaseHTTPRequestHandler) -> None:
         self.hub, self.handler = hub, handler
-        self.path = urllib.parse.unquote(urllib.parse.urlsplit(handler.path).path)
+        self.quoted = urllib.parse.urlsplit(handler.path).path
+        self.path = urllib.parse.unquote(self.quoted)
         self.body = handler.rfile.read(int(handler.headers.get("Content-Length") or 0))
         if handler.headers.get("Transfer-Encoding") == "chunked":
             self.body = b"".join(_chunks(handler.rfile))
@@ -112,9 +113,10 @@ class Answer:
                 del self.hub.faults[index]
                 return self.json({"error": "told to fail"}, status)
         for pattern, methods, do in ROUTES:
-            match = re.fullmatch(pattern, self.path)
+            match = re.fullmatch(pattern, self.quoted)  # a quoted slash is part of a revision
             if match is not None and method in methods:
-                return do(self, **match.groupdict())
+                found = match.groupdict().items()
+                return do(self, **{k: v and urllib.parse.unquote(v) for k, v in found})
         return self.json({"error": f"no such route: {method} {self.path}"}, 404)
 
     # Answers
