@@ -9,14 +9,14 @@ import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
@@ -34,6 +34,9 @@ from weighttraj.format import (
     RunInfo,
 )
 from weighttraj.format.layout import Role
+
+Acting = Literal["squashed_gaussian", "squashed", "greedy"]
+"""How the network of an off-policy algorithm acts: see ``PolicySpec.acting``."""
 
 PACKAGES = ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy", "zarr", "weighttraj")
 
@@ -155,6 +158,8 @@ def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> 
         inputs = "observation" if i == 0 else f"hidden_{i - 1}"
         outputs = "action" if i == len(policy.layers) - 1 else f"hidden_{i}"
         axes[weight], axes[bias] = (outputs, inputs), (outputs,)
+    if policy.log_std:  # beside the last layer
+        axes |= dict(zip(policy.log_std, (axes[n] for n in policy.layers[-1]), strict=True))
     tensors: dict[str, tuple[tuple[int, ...], Role, tuple[str, ...]]] = {}
     for name, parameter in parameters.items():
         shape = tuple(parameter.shape)
@@ -166,15 +171,71 @@ def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> 
 
 def describe_agent(agent: Agent, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
     """Return what it takes to rebuild the network that acts, or the reasons why it cannot be."""
-    network = agent.network
-    if isinstance(network, ActorCriticPolicy):
-        return describe_policy(network, unknown_wrappers)
-    space = network.observation_space
-    return PolicySpec(
+    if isinstance(agent.network, ActorCriticPolicy):
+        return describe_policy(agent.network, unknown_wrappers)
+    spec, reasons = _off_policy(agent)
+    if not reasons:
+        layout = describe_layout(agent.actor, spec)
+        reasons = find_difference(agent.network, spec, layout, agent.prefix)
+    if reasons:
+        spec = replace(spec, acting="", layers=(), log_std=(), activation="")
+    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
+    if unknown_wrappers:
+        spec = replace(spec, acting="")
+    return replace(spec, cannot_rebuild=tuple(reasons))
+
+
+def _off_policy(agent: Agent) -> tuple[PolicySpec, list[str]]:
+    """The acting network of an off-policy algorithm, and the reasons why it is certainly none."""
+    network, space = agent.network, agent.network.observation_space
+    reasons = _surroundings(network)
+    head, odd = describe_head(network.action_space)
+    parts = _parts(network)
+    if parts is None:
+        return PolicySpec(kind="other"), [f"policy class {type(network).__name__}", *reasons]
+    acting, net, prefix, last, log_std = parts
+    linear, activation, more = _hidden(net)
+    names = [f"{agent.prefix}{prefix}.{i}" for i in linear] + [f"{agent.prefix}{last}"]
+    layers = tuple((f"{name}.weight", f"{name}.bias") for name in names)
+    log_std = tuple(f"{agent.prefix}{name}" for name in log_std)
+    reasons += [*odd, *more]
+    reasons += _other_parameters(agent.actor, {n for pair in (*layers, log_std) for n in pair})
+    if not isinstance(space, spaces.Box):
+        reasons.append(f"observations in a {type(space).__name__} space")
+    if is_image_space(space):
+        reasons.append("observations that SB3 takes for images and scales")
+    spec = PolicySpec(
         kind="other",
+        acting=acting,
+        activation=activation,
+        layers=layers,
+        log_std=log_std,
         observation_shape=tuple(space.shape or ()) if isinstance(space, spaces.Box) else (),
-        cannot_rebuild=(f"policy class {type(network).__name__}",),
+        **(head | {"head": "other"}),
     )
+    return spec, reasons
+
+
+def _parts(network: Any) -> tuple[Acting, nn.Sequential, str, str, tuple[str, ...]] | None:
+    """How a network acts, its hidden part and the name of that, of the last layer, and the names of
+    the parameters of the deviation; None: it is not known how it acts."""
+    hidden, mu = getattr(network, "latent_pi", None), getattr(network, "mu", None)
+    if isinstance(hidden, nn.Sequential) and isinstance(mu, nn.Linear):  # SAC
+        if isinstance(getattr(network, "log_std", None), nn.Linear):
+            names = ("log_std.weight", "log_std.bias")
+            return "squashed_gaussian", hidden, "latent_pi", "mu", names
+    elif isinstance(mu, nn.Sequential) and len(mu) > 1 and type(mu[-1]) is nn.Tanh:  # TD3
+        return "squashed", nn.Sequential(*list(mu.children())[:-2]), "mu", f"mu.{len(mu) - 2}", ()
+    net = getattr(network, "q_net", None)
+    if isinstance(net, nn.Sequential) and len(net):  # DQN
+        return (
+            "greedy",
+            nn.Sequential(*list(net.children())[:-1]),
+            "q_net",
+            f"q_net.{len(net) - 1}",
+            (),
+        )
+    return None
 
 
 def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
@@ -208,7 +269,7 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
     if layers:
         wanted = {name for pair in layers for name in pair}
         gaussian = {"log_std"} if head["head"] == "gaussian" else set()
-        reasons += _other_parameters(policy, wanted | gaussian)
+        reasons += _other_parameters(actor_parameters(policy), wanted | gaussian)
     spec = PolicySpec(
         kind="mlp",
         activation=activation,
@@ -219,9 +280,8 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
     return spec, reasons
 
 
-def _other_parameters(policy: ActorCriticPolicy, wanted: set[str]) -> list[str]:
+def _other_parameters(parameters: dict[str, nn.Parameter], wanted: set[str]) -> list[str]:
     """Reasons why the parameters are not those of a multilayer perceptron."""
-    parameters = actor_parameters(policy)
     reasons = []
     if more := sorted(parameters.keys() - wanted):
         reasons.append(f"parameters that no multilayer perceptron has: {_few(more)}")
@@ -320,6 +380,17 @@ def describe_provenance() -> Provenance:
 
 def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, list[str]]:
     """Layer names, activation, and reasons why this is no plain MLP."""
+    reasons = _surroundings(policy)
+    net = getattr(getattr(policy, "mlp_extractor", None), "policy_net", None)
+    if not isinstance(net, nn.Sequential) or not isinstance(policy.action_net, nn.Linear):
+        return (), "", [*reasons, f"policy class {type(policy).__name__} with no policy_net"]
+    linear, activation, odd = _hidden(net)
+    prefixes = [f"mlp_extractor.policy_net.{i}" for i in linear] + ["action_net"]
+    return tuple((f"{p}.weight", f"{p}.bias") for p in prefixes), activation, [*reasons, *odd]
+
+
+def _surroundings(policy: BasePolicy) -> list[str]:
+    """Return reasons why a network has more to it than its layers."""
     reasons = []
     if not isinstance(policy.features_extractor, FlattenExtractor):
         reasons.append(f"features from {type(policy.features_extractor).__name__}")
@@ -327,9 +398,12 @@ def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, l
         reasons.append("buffers beside the parameters, which are not stored")
     if any(getattr(module, "_compiled_call_impl", None) for module in policy.modules()):
         reasons.append("layers compiled by torch.compile, which may move the last bits")
-    net = getattr(getattr(policy, "mlp_extractor", None), "policy_net", None)
-    if not isinstance(net, nn.Sequential) or not isinstance(policy.action_net, nn.Linear):
-        return (), "", [*reasons, f"policy class {type(policy).__name__} with no policy_net"]
+    return reasons
+
+
+def _hidden(net: nn.Sequential) -> tuple[list[int], str, list[str]]:
+    """Return the places of linear layers, the activation, and reasons why it is no plain MLP."""
+    reasons = []
     linear = [i for i, module in enumerate(net) if isinstance(module, nn.Linear)]
     kinds = {type(m) for m in net if not isinstance(m, nn.Linear)}
     known = kinds & ACTIVATIONS.keys()
@@ -337,9 +411,7 @@ def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, l
     if kinds != known or len(kinds) > 1 or len(net) != 2 * len(linear) or changed:
         names = sorted(kind.__name__ for kind in kinds)
         reasons.append(f"hidden modules {names}, not one activation after each linear layer")
-    activation = next((ACTIVATIONS[kind] for kind in known), "")
-    prefixes = [f"mlp_extractor.policy_net.{i}" for i in linear] + ["action_net"]
-    return tuple((f"{p}.weight", f"{p}.bias") for p in prefixes), activation, reasons
+    return linear, next((ACTIVATIONS[kind] for kind in known), ""), reasons
 
 
 def _role(name: str) -> Role:

@@ -8,7 +8,7 @@ random weights.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +30,9 @@ _SCALES = (None, 0.1, 1.0)
 """Deviations of the random weights of each comparison; None: the present weights."""
 
 
-def find_difference(policy: ActorCriticPolicy, spec: PolicySpec, layout: ParamLayout) -> list[str]:
+def find_difference(
+    policy: BasePolicy, spec: PolicySpec, layout: ParamLayout, prefix: str = ""
+) -> list[str]:
     """Return why a policy acts otherwise than its description says; an empty list if it does not.
 
     Neither the policy nor the global random generators change.
@@ -39,6 +41,7 @@ def find_difference(policy: ActorCriticPolicy, spec: PolicySpec, layout: ParamLa
         policy: of the agent.
         spec: its description.
         layout: order of the parameters that it acts with.
+        prefix: what their names in the layout have before those in the policy.
     """
     with undisturbed():
         try:
@@ -46,7 +49,7 @@ def find_difference(policy: ActorCriticPolicy, spec: PolicySpec, layout: ParamLa
         except Exception as error:  # the code of a stranger may raise anything
             return [f"it cannot be copied, and so not be compared with the agent: {_line(error)}"]
         try:
-            return _differences(twin, spec, layout)
+            return _differences(twin, spec, layout, prefix)
         except Exception as error:
             return [f"it cannot be compared with the agent: {_line(error)}"]
 
@@ -129,7 +132,7 @@ def _randomise(module: nn.Module, scale: float | None) -> None:
             parameter.normal_(std=scale, generator=generator)
 
 
-def _rebuild(spec: PolicySpec, layout: ParamLayout, named: dict[str, Tensor]) -> Policy:
+def _rebuild(spec: PolicySpec, layout: ParamLayout, named: Mapping[str, Tensor]) -> Policy:
     """The policy as it is rebuilt from what a run stores."""
     return Policy(spec, layout, layout.flatten({p.name: named[p.name] for p in layout.params}))
 
@@ -159,17 +162,15 @@ def _computed(value: object, depth: int) -> Iterator[Tensor]:
 
 
 @torch.no_grad()
-def _differences(twin: ActorCriticPolicy, spec: PolicySpec, layout: ParamLayout) -> list[str]:
+def _differences(twin: BasePolicy, spec: PolicySpec, layout: ParamLayout, prefix: str) -> list[str]:
     generator = torch.Generator().manual_seed(0)
     observations = _observations(twin.observation_space)
     for scale in _SCALES:
         if scale is not None:
             for parameter in twin.parameters():
                 parameter.normal_(std=scale, generator=generator)
-        named = dict(twin.named_parameters())
-        rebuilt = Policy(
-            spec, layout, layout.flatten({p.name: named[p.name] for p in layout.params})
-        )
+        named = {f"{prefix}{name}": p for name, p in twin.named_parameters()}
+        rebuilt = _rebuild(spec, layout, named)
         for training in (False, True):
             twin.set_training_mode(training)
             for what, got, expected in _pairs(twin, rebuilt, observations):
@@ -184,17 +185,19 @@ def _differences(twin: ActorCriticPolicy, spec: PolicySpec, layout: ParamLayout)
 
 
 def _pairs(
-    twin: ActorCriticPolicy, rebuilt: Policy, observations: np.ndarray
+    twin: BasePolicy, rebuilt: Policy, observations: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield what is compared: its name, what the rebuilt policy gives, what the agent gives."""
-    tensor = torch.from_numpy(observations)
-    got = rebuilt.distribution(torch.from_numpy(rebuilt.normalize(observations)))
-    expected = twin.get_distribution(tensor).distribution
-    for name in ("logits",) if isinstance(got, Categorical) else ("mean", "stddev"):
-        yield f"{name} of the action distribution", _numpy(got, name), _numpy(expected, name)
-    space = twin.action_space
+    yield from _predicted(twin, rebuilt, observations)
+    if isinstance(twin, ActorCriticPolicy):
+        yield from _rolled(twin, rebuilt, observations)
+
+
+def _predicted(
+    twin: BasePolicy, rebuilt: Policy, observations: np.ndarray
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield the actions of ``predict``, for many observations and for one."""
     for deterministic in (True, False):
-        kind = "deterministic" if deterministic else "sampled"
         for batch in (observations, observations[0]):
             # Our own generators would not do: SB3 samples with the global one.
             torch.manual_seed(0)
@@ -203,7 +206,22 @@ def _pairs(
             torch.manual_seed(0)
             predicted, _ = twin.predict(batch, deterministic=deterministic)
             twin.set_training_mode(training)
+            kind = "deterministic" if deterministic else "sampled"
             yield f"{kind} actions of predict", actions, np.asarray(predicted)
+
+
+def _rolled(
+    twin: ActorCriticPolicy, rebuilt: Policy, observations: np.ndarray
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield the distribution over actions, and the actions of a rollout."""
+    tensor = torch.from_numpy(observations)
+    got = rebuilt.distribution(torch.from_numpy(rebuilt.normalize(observations)))
+    expected = twin.get_distribution(tensor).distribution
+    for name in ("logits",) if isinstance(got, Categorical) else ("mean", "stddev"):
+        yield f"{name} of the action distribution", _numpy(got, name), _numpy(expected, name)
+    space = twin.action_space
+    for deterministic in (True, False):
+        kind = "deterministic" if deterministic else "sampled"
         torch.manual_seed(0)
         actions, _ = rebuilt.predict(observations, deterministic=deterministic)
         torch.manual_seed(0)

@@ -16,7 +16,7 @@ def find_misfit(policy: PolicySpec, layout: ParamLayout, obs_norm: ObsNorm | Non
         layout: its parameters.
         obs_norm: its normaliser of observations; None: it has none.
     """
-    if policy.kind != "mlp":
+    if policy.kind != "mlp" and not policy.acting:
         return ""
     if obs_norm is not None and obs_norm.shape != policy.observation_shape:
         return (
@@ -25,7 +25,8 @@ def find_misfit(policy: PolicySpec, layout: ParamLayout, obs_norm: ObsNorm | Non
         )
     shapes = {spec.name: spec.shape for spec in layout.params}
     named = [name for pair in policy.layers for name in pair]
-    named += ["log_std"] if policy.head == "gaussian" else []
+    named += ["log_std"] if policy.mode == "gaussian" else []
+    named += policy.log_std
     if missing := [name for name in named if name not in shapes]:
         return f"the layout has no parameter {missing[0]!r}"
     if not policy.layers:
@@ -45,15 +46,20 @@ def find_misfit(policy: PolicySpec, layout: ParamLayout, obs_norm: ObsNorm | Non
 def _misfit_of_actions(
     policy: PolicySpec, size: int, shapes: dict[str, tuple[int, ...]], given: str
 ) -> str:
-    if policy.head == "categorical":
+    if policy.mode in ("categorical", "greedy"):
         return ""
-    if policy.head != "gaussian":
+    if not policy.is_continuous:
         return f"a multilayer perceptron with the head {policy.head!r}"
     if math.prod(policy.action_shape) != size:
         wanted = math.prod(policy.action_shape)
         return f"{given}, and an action {policy.action_shape} has {wanted}"
+    if policy.mode == "squashed_gaussian":
+        last = shapes[policy.layers[-1][0]]
+        if [shapes[name] for name in policy.log_std] != [last, last[:1]]:
+            return f"the layer of the deviation {policy.log_std} is not as large as the last one"
+    deviations = math.prod(shapes["log_std"]) if policy.mode == "gaussian" else size
     counts = {
-        "log_std": math.prod(shapes["log_std"]),
+        "log_std": deviations,
         "action_low": len(policy.action_low),
         "action_high": len(policy.action_high),
     }

@@ -75,8 +75,31 @@ class PolicySpec:
     """Lower bounds of a continuous action, flattened; actions are clipped to them."""
     action_high: tuple[float, ...] = ()
     """Upper bounds of a continuous action, flattened."""
+    acting: Literal["", "squashed_gaussian", "squashed", "greedy"] = ""
+    """How a fully connected network of an off-policy algorithm acts; empty: as ``kind`` and
+    ``head`` say, which are ``other`` if this is not empty. ``squashed_gaussian`` (SAC): tanh of a
+    Gaussian whose deviation is the output of the layer ``log_std``, within exp(-20) and exp(2);
+    ``squashed`` (TD3): tanh of the outputs; ``greedy`` (DQN): the largest output. Values from -1
+    to 1 are stretched to the bounds of the action."""
+    log_std: tuple[str, ...] = ()
+    """(weight, bias) of the layer beside the last one that gives the logarithm of the deviation."""
     cannot_rebuild: tuple[str, ...] = ()
     """Reasons why the policy cannot be rebuilt from this description; empty: it can."""
+
+    @property
+    def mode(self) -> str:
+        """How outputs become actions: ``acting`` or the head; ``other``: it cannot be rebuilt."""
+        return self.acting or (self.head if self.kind == "mlp" else "other")
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether actions are vectors within bounds; else they are numbers of choices."""
+        return self.mode not in ("categorical", "greedy", "other")
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether the policy can be sampled; else it acts in one way only."""
+        return self.mode in ("gaussian", "categorical", "squashed_gaussian")
 
 
 @dataclass(frozen=True, kw_only=True)

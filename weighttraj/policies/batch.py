@@ -11,9 +11,17 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 from torch.distributions import Categorical, Normal
 
+from weighttraj.errors import PolicyError
 from weighttraj.format import ParamLayout, PolicySpec, Run
 from weighttraj.format.schema import ObsNorm
-from weighttraj.policies.policy import ACTIVATIONS, network, normalize, to_actions
+from weighttraj.policies.policy import (
+    ACTIVATIONS,
+    LOG_STD_RANGE,
+    deviation_layer,
+    network,
+    normalize,
+    to_actions,
+)
 
 
 class PolicyBatch:
@@ -48,6 +56,8 @@ class PolicyBatch:
         layers, log_std = network(spec, layout, self.weights, obs_norm)
         self._layers = [(weight.transpose(1, 2), bias[:, None]) for weight, bias in layers]
         self._std = None if log_std is None else log_std.exp()[:, None]
+        deviation = deviation_layer(spec, layout, self.weights)
+        self._deviation = deviation and (deviation[0].transpose(1, 2), deviation[1][:, None])
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -69,22 +79,43 @@ class PolicyBatch:
 
     @torch.no_grad()
     def outputs(self, inputs: Float32[np.ndarray, "policy episode *obs"]) -> Tensor:
-        """Means or logits (policy, episode, output) for network inputs."""
+        """Means, logits or values (policy, episode, output) for network inputs."""
+        return self._outputs(inputs)[0]
+
+    def _outputs(
+        self, inputs: Float32[np.ndarray, "policy episode *obs"]
+    ) -> tuple[Tensor, Tensor | None]:
+        """Outputs of the last layer, and the deviation of each where the head has one."""
         hidden = torch.from_numpy(inputs).flatten(2)
         activation = ACTIVATIONS[self.spec.activation]
         for weight, bias in self._layers[:-1]:
             hidden = activation(torch.baddbmm(bias, hidden, weight))
         weight, bias = self._layers[-1]
-        return torch.baddbmm(bias, hidden, weight)
+        outputs = torch.baddbmm(bias, hidden, weight)
+        if self._deviation is None:
+            return outputs, self._std
+        weight, bias = self._deviation
+        return outputs, torch.baddbmm(bias, hidden, weight).clamp(*LOG_STD_RANGE).exp()
 
     def distribution(
         self, inputs: Float32[np.ndarray, "policy episode *obs"]
     ) -> Normal | Categorical:
-        """Distributions over unclipped actions for network inputs, (policy, episode, ...)."""
-        outputs = self.outputs(inputs)
-        if self._std is None:
+        """Distributions over unclipped actions for network inputs, (policy, episode, ...).
+
+        Raises:
+            PolicyError: the policies have none, as they act in one way only.
+        """
+        if not self.spec.is_sampled:
+            raise PolicyError(
+                "these policies have no distribution over actions",
+                expected="policies of PPO, A2C or SAC",
+                got=f"such that act in one way only ({self.spec.mode})",
+                do="compare their actions: policies.act",
+            )
+        outputs, std = self._outputs(inputs)
+        if std is None:
             return Categorical(logits=outputs, validate_args=False)
-        return Normal(outputs, self._std.expand_as(outputs), validate_args=False)
+        return Normal(outputs, std.expand_as(outputs), validate_args=False)
 
     @torch.no_grad()
     def act(self, observations: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
@@ -94,13 +125,14 @@ class PolicyBatch:
             observations: raw, ``(policy, episode, *obs)``.
             noise: None: act by the distribution's mode. For a Gaussian head: standard normal,
                 float32 (episode, action). For a categorical one: uniform in [0, 1), (episode,).
+                Policies that act in one way only take no notice of it.
         """
-        outputs = self.outputs(self.normalize(observations))
-        if self._std is not None:
-            if noise is not None:
-                outputs = outputs + self._std * torch.from_numpy(noise)
+        outputs, std = self._outputs(self.normalize(observations))
+        if self.spec.is_continuous:
+            if noise is not None and std is not None:
+                outputs = outputs + std * torch.from_numpy(noise)
             return to_actions(self.spec, outputs)
-        if noise is None:
+        if noise is None or not self.spec.is_sampled:
             return to_actions(self.spec, outputs.argmax(2))
         cumulative = outputs.double().softmax(2).cumsum(2)
         choice = (torch.from_numpy(noise)[:, None] > cumulative).sum(2)
@@ -108,7 +140,7 @@ class PolicyBatch:
 
     def __repr__(self) -> str:
         units = [bias.shape[2] for _, bias in self._layers]
-        return f"<PolicyBatch of {len(self)}: {self.spec.head}, units {units}>"
+        return f"<PolicyBatch of {len(self)}: {self.spec.mode}, units {units}>"
 
 
 def load_policies(

@@ -80,6 +80,13 @@ def export_sb3(run: Run, t: int, folder: str | Path) -> SB3Export:
             trained in, or SB3 has no such normaliser.
     """
     folder = Path(folder)
+    if run.info.policy.acting:
+        raise PolicyError(
+            "only policies of PPO and A2C are exported",
+            got=f"a policy that acts as {run.info.policy.acting}",
+            where=run.path,
+            do="load the snapshot into a model of your own with run.load_into(model, t)",
+        )
     venv = DummyVecEnv([lambda: _Nowhere(*_spaces(run))])
     normalize = _vec_normalize(run, t, venv)
     model, critic = _model(run, t, venv)

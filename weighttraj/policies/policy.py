@@ -25,10 +25,16 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "elu": functional.elu,
     "leaky_relu": functional.leaky_relu,
 }
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Within which SAC keeps the logarithm of its deviation."""
 
 
 class Policy:
-    """A multilayer perceptron with a Gaussian or categorical head, and its normaliser.
+    """A multilayer perceptron with a head that turns outputs into actions, and its normaliser.
+
+    The head is that of PPO and A2C (Gaussian or categorical), SAC (squashed Gaussian), TD3
+    (squashed) or DQN (greedy). The noise that TD3 and DQN explore with belongs to their training,
+    not to the policy, which acts in one way only, sampled or not.
 
     Actions equal those of the SB3 agent bit by bit, for the same observations, batch size and
     torch seed.
@@ -57,6 +63,7 @@ class Policy:
         self.obs_norm, self.stats = obs_norm, stats
         self.weights = np.array(weights, np.float32)
         layers, self._log_std = network(spec, layout, self.weights, obs_norm)
+        self._deviation = deviation_layer(spec, layout, self.weights)
         # Matrix products give other last bits where a weight does not lie as torch aligns it.
         self._layers = [(weight.clone(), bias.clone()) for weight, bias in layers]
 
@@ -72,12 +79,23 @@ class Policy:
 
     @torch.no_grad()
     def distribution(self, inputs: Tensor) -> Normal | Categorical:
-        """Distribution over unclipped actions for network inputs ``(batch, *observation)``."""
-        hidden = inputs.flatten(1)
-        activation = ACTIVATIONS[self.spec.activation]
-        for weight, bias in self._layers[:-1]:
-            hidden = activation(functional.linear(hidden, weight, bias))
-        outputs = functional.linear(hidden, *self._layers[-1])
+        """Distribution over unclipped actions for network inputs ``(batch, *observation)``.
+
+        Of a squashed Gaussian: before tanh.
+
+        Raises:
+            PolicyError: the policy has none, as it acts in one way only.
+        """
+        outputs, deviation = self._outputs(inputs)
+        if not self.spec.is_sampled:
+            raise PolicyError(
+                "this policy has no distribution over actions",
+                expected="a policy of PPO, A2C or SAC",
+                got=f"one that acts in one way only ({self.spec.mode})",
+                do="compare its actions: policy.predict",
+            )
+        if deviation is not None:
+            return Normal(outputs, torch.ones_like(outputs) * deviation, validate_args=False)
         if self._log_std is None:
             return Categorical(logits=outputs, validate_args=False)
         return Normal(outputs, torch.ones_like(outputs) * self._log_std.exp(), validate_args=False)
@@ -114,11 +132,27 @@ class Policy:
                 do="pass observations of the run's environment",
             )
         inputs = self.normalize(observation if batched else observation[None])
-        distribution = self.distribution(torch.from_numpy(inputs))
-        actions = self._choose(distribution, deterministic)
+        actions = self._choose(torch.from_numpy(inputs), deterministic)
         return (actions if batched else actions.squeeze(0)), state
 
-    def _choose(self, distribution: Normal | Categorical, deterministic: bool) -> np.ndarray:
+    @torch.no_grad()
+    def _outputs(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Outputs of the last layer, and the deviation where a layer gives it."""
+        hidden = inputs.flatten(1)
+        activation = ACTIVATIONS[self.spec.activation]
+        for weight, bias in self._layers[:-1]:
+            hidden = activation(functional.linear(hidden, weight, bias))
+        outputs = functional.linear(hidden, *self._layers[-1])
+        if self._deviation is None:
+            return outputs, None
+        return outputs, functional.linear(hidden, *self._deviation).clamp(*LOG_STD_RANGE).exp()
+
+    def _choose(self, inputs: Tensor, deterministic: bool) -> np.ndarray:
+        if not self.spec.is_sampled:
+            outputs, _ = self._outputs(inputs)
+            greedy = self.spec.mode == "greedy"
+            return to_actions(self.spec, outputs.argmax(1) if greedy else outputs)
+        distribution = self.distribution(inputs)
         if isinstance(distribution, Categorical):
             choice = distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call]
             return to_actions(self.spec, choice)
@@ -126,7 +160,7 @@ class Policy:
 
     def __repr__(self) -> str:
         units = [len(bias) for _, bias in self._layers]
-        return f"<Policy {self.spec.head}, {self.spec.activation}, units {units}>"
+        return f"<Policy {self.spec.mode}, {self.spec.activation}, units {units}>"
 
 
 def load_policy(run: Run, t: int = -1) -> Policy:
@@ -151,7 +185,7 @@ def network(
     Raises:
         PolicyError: the spec describes no policy that can be rebuilt.
     """
-    if spec.kind != "mlp" or spec.activation not in ACTIVATIONS or not spec.layers:
+    if spec.mode == "other" or spec.activation not in ACTIVATIONS or not spec.layers:
         raise PolicyError(
             "this policy cannot be rebuilt from its weights",
             expected="a fully connected network on flat observations, with a Gaussian or "
@@ -169,7 +203,18 @@ def network(
         )
     tensors = {name: torch.from_numpy(part) for name, part in layout.unflatten(weights).items()}
     layers = [(tensors[weight], tensors[bias]) for weight, bias in spec.layers]
-    return layers, tensors["log_std"] if spec.head == "gaussian" else None
+    return layers, tensors["log_std"] if spec.mode == "gaussian" else None
+
+
+def deviation_layer(
+    spec: PolicySpec, layout: ParamLayout, weights: Float32[np.ndarray, "*policy param"]
+) -> tuple[Tensor, Tensor] | None:
+    """Return (weight, bias) of the layer that gives the deviation; None: there is none."""
+    if spec.mode != "squashed_gaussian":
+        return None
+    tensors = layout.unflatten(weights)
+    weight, bias = (torch.from_numpy(tensors[name].copy()) for name in spec.log_std)
+    return weight, bias
 
 
 def normalize(
@@ -188,16 +233,21 @@ def normalize(
 
 
 def to_actions(spec: PolicySpec, values: Tensor) -> np.ndarray:
-    """Actions for the environment (..., *action): shaped, and clipped to the action space.
+    """Actions for the environment (..., *action): shaped, and clipped or stretched to its bounds.
 
     Args:
         spec: of the policy.
-        values: (..., action) of a Gaussian head, or (...) of a categorical one.
+        values: (..., action) of continuous actions, before tanh; or (...) of choices.
     """
-    if spec.head != "gaussian":
+    if not spec.is_continuous:
         return values.numpy()
+    if spec.mode != "gaussian":
+        values = values.tanh()
     low, high = (_bound(x, spec.action_shape) for x in (spec.action_low, spec.action_high))
-    return np.asarray(np.clip(values.numpy().reshape(*values.shape[:-1], *low.shape), low, high))
+    actions = values.numpy().reshape(*values.shape[:-1], *low.shape)
+    if spec.mode != "gaussian":
+        return np.asarray(low + (0.5 * (actions + 1.0) * (high - low)))
+    return np.asarray(np.clip(actions, low, high))
 
 
 def _bound(values: tuple[float, ...], shape: tuple[int, ...]) -> np.ndarray:

@@ -215,7 +215,7 @@ class Evaluator:
         """What chance adds to the actions of a step, (episode, ...): the same for all policies."""
         size = max(1, len(spec.action_low))
         with self._drawing:
-            drawn = self._noise.setdefault((spec.head, size), [])
+            drawn = self._noise.setdefault((spec.mode, size), [])
             while step >= len(drawn) * _NOISE_STEPS:
                 part = [self._draw(seed, len(drawn), spec) for seed in self.seeds]
                 drawn.append(np.stack(part, 1))
@@ -227,7 +227,7 @@ class Evaluator:
         generator = np.random.default_rng([seed, 1])
         size = len(spec.action_low)
         shape = (part + 1, _NOISE_STEPS, size) if size else (part + 1, _NOISE_STEPS)
-        if spec.head == "gaussian":
+        if spec.is_continuous:
             return np.asarray(generator.standard_normal(shape, np.float32)[part])
         return np.asarray(generator.random(shape)[part])
 
@@ -285,12 +285,12 @@ def _stands_for_another(text: str) -> bool:
 
 def _check_spaces(spec: PolicySpec, env: gym.Env[Any, Any]) -> None:
     observed, acted = env.observation_space, env.action_space
-    kind = gym.spaces.Box if spec.head == "gaussian" else gym.spaces.Discrete
+    kind = gym.spaces.Box if spec.is_continuous else gym.spaces.Discrete
     fits = isinstance(acted, kind) and acted.shape == spec.action_shape
     if observed.shape != spec.observation_shape or not fits:
         raise PolicyError(
             "the policy does not fit the environment",
-            expected=f"observations {spec.observation_shape}, {spec.head} actions "
+            expected=f"observations {spec.observation_shape}, {spec.mode} actions "
             f"{spec.action_shape}",
             got=f"observations {observed}, actions {acted}",
             where=env,

@@ -212,7 +212,7 @@ def _composition(dataset: Dataset) -> str:
     ]
     lines = [
         f"- runs: {', '.join(f'{count} {name}' for name, count in parts.items())}",
-        f"- policy: {run.info.policy.kind}, {run.info.policy.head} head, "
+        f"- policy: {run.info.policy.kind}, {run.info.policy.mode} head, "
         f"{run.info.policy.activation or 'other'} units: {' x '.join(hidden)}",
         "",
         f"| array of `{run.id}` | shape | type |",
