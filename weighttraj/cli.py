@@ -229,7 +229,7 @@ def _combine(
 
 @app.command(name="select")
 def _select(
-    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set: path or id")],
+    path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set: path or id")],
     seeds: Annotated[str, tyro.conf.arg(help="seeds of the runs, such as 0:4,30,40:44")],
     out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
 ) -> None:
