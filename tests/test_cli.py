@@ -157,3 +157,22 @@ def test_a_reader_that_has_seen_enough_is_no_error(
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_module_is_a_command_too() -> None:
+    command = [sys.executable, "-m", "weighttraj", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"weighttraj {wt.__version__}\n")
+
+
+def test_own_runs_become_a_data_set(small_dataset: Path, tmp_path: Path) -> None:
+    runs = sorted((small_dataset / "runs").glob("*.zip"))[:2]
+    more = ("--split", "seed0000=train", "seed0001=test", "--version", "3", "--licence", "CC0-1.0")
+    done = run("weighttraj", "create", tmp_path / "mine", *runs, *more)
+    assert done.returncode == 0, done.stderr
+    made = wt.open(tmp_path / "mine")
+    assert [(r.id, r.split) for r in made] == [("seed0000", "train"), ("seed0001", "test")]
+    assert (made.info.id, made.info.version, made.info.licence) == ("mine", "3", "CC0-1.0")
+    done = run("weighttraj", "upload", runs[0], f"file://{tmp_path}/there")
+    assert done.returncode == 1
+    assert "weighttraj create OUT" in done.stderr

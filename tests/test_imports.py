@@ -86,7 +86,6 @@ ALLOWED = {
     ],
     "weighttraj.format.writer": [
         "weighttraj.errors",
-        REMOTE,
         "weighttraj.format.live",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
@@ -118,6 +117,7 @@ ALLOWED = {
     "weighttraj.format.reader": [
         "weighttraj.errors",
         "weighttraj.format.catalog",
+        "weighttraj.format.codecs",
         "weighttraj.format.layout",
         "weighttraj.format.locate",
         "weighttraj.format.objects",
@@ -155,7 +155,6 @@ ALLOWED = {
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
-        REMOTE,
         "weighttraj.collect",
         "weighttraj.policies.kernels",
         "weighttraj.policies.policy",
@@ -239,7 +238,7 @@ ALLOWED = {
         "weighttraj.format.tables",
         "weighttraj.registry.croissant",
     ],
-    "weighttraj.registry.transfer": ["weighttraj.format.catalog", "weighttraj.remote"],
+    "weighttraj.registry.transfer": ["weighttraj.format.catalog"],
     "weighttraj.registry.download": [
         "weighttraj.progress",
         "weighttraj.errors",
@@ -267,9 +266,9 @@ ALLOWED = {
         "door weighttraj.format",
         "weighttraj.format.catalog",
         "weighttraj.format.locate",
-        "weighttraj.format.objects",
         "weighttraj.remote",
     ],
+    "weighttraj.__main__": ["door weighttraj.cli"],
     "weighttraj.cli": [
         "door weighttraj",
         "weighttraj.errors",
@@ -449,7 +448,7 @@ ALLOWED = {
         "tipl.zoo",
         "door weighttraj",
     ],
-    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", REMOTE, "weighttraj.terminal"],
+    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", "weighttraj.terminal"],
     "tipl": ["tipl", "weighttraj.errors"],
 }
 

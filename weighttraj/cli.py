@@ -20,7 +20,7 @@ from weighttraj.errors import RegistryError, WeightTrajError
 from weighttraj.format.lint import lint_returns
 from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.plugins import import_modules
-from weighttraj.remote import RemotePath, here, is_remote
+from weighttraj.remote import is_remote
 from weighttraj.terminal import Output, while_read
 
 Imports = Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")]
@@ -54,7 +54,7 @@ def _collect(args: _Collect) -> None:
     """Collect the data set of a recipe, or go on where it stopped."""
     from weighttraj.collect.recipe import parse_seeds
 
-    recipe = wt.collect.read_recipe(here(args.recipe))
+    recipe = wt.collect.read_recipe(args.recipe)
     out = args.out or Path(COLLECTED) / recipe.id
     seeds = None if args.seeds is None else parse_seeds(args.seeds)
     dataset = wt.collect.collect(
@@ -72,8 +72,8 @@ def _collect(args: _Collect) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Returns:
-    path: tyro.conf.Positional[str]
-    """Data set: a path, or the id of one that is found here."""
+    path: tyro.conf.Positional[Path]
+    """Data set (path or id) or run."""
     episodes: int = 10
     """Episodes for each action mode; the same seeds for every policy."""
     every: int = 10
@@ -144,10 +144,10 @@ def _show(
 ) -> None:
     """Print what a data set or a run holds."""
     if is_remote(path):
-        is_run = RemotePath.parse(path).name.removesuffix(".zip").endswith(".zarr")
+        is_run = path.removesuffix(".zip").endswith(".zarr")
     else:
-        place = locate(path)
-        is_run = not (place / "dataset.json").is_file() and place.suffix != ".h5"
+        here = locate(path)
+        is_run = not (here / "dataset.json").is_file() and here.suffix != ".h5"
     if not is_run:
         print(wt.open(path))
         return
@@ -216,6 +216,44 @@ def _text(value: object) -> str:
     return f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Create:
+    out: tyro.conf.Positional[Path]
+    """Folder of the new data set; its name becomes the data set's id."""
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Finished runs: folders or packed files."""
+    split: tuple[str, ...] = ()
+    """Parts of the data set: run0=train run1=test; other runs are in no part."""
+    version: str = "1"
+    """Version of the data."""
+    licence: str = "CC-BY-4.0"
+    """Licence of the data, as an SPDX identifier."""
+
+
+@app.command(name="create")
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes)
+def _create(args: _Create) -> None:
+    """Make a data set of runs of your own; these stay."""
+    pairs = [text.rpartition("=") for text in args.split]
+    if wrong := [text for text in args.split if not text.rpartition("=")[0]]:
+        raise RegistryError(
+            "a part does not say which run is in it",
+            expected="RUN_ID=train, RUN_ID=validation or RUN_ID=test",
+            got=" ".join(wrong),
+            do="give --split run0=train run1=test",
+        )
+    splits = {run: part for run, _, part in pairs}
+    made = registry.create(
+        args.runs,
+        args.out,
+        splits=splits,
+        version=args.version,
+        licence=args.licence,
+        console=console,
+    )
+    print(made)
+
+
 @app.command(name="combine")
 def _combine(
     paths: Annotated[
@@ -241,7 +279,7 @@ def _select(
 
 @app.command(name="split")
 def _split(
-    path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set: path or id")],
+    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set: path or id")],
     out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
     fractions: Annotated[
         tuple[float, float, float], tyro.conf.arg(help="of the runs: training, validation, test")
@@ -340,7 +378,7 @@ def _sure(question: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _Verify:
-    path: tyro.conf.Positional[str]
+    path: tyro.conf.Positional[Path]
     """Data set (path or id) or run."""
     deep: bool = False
     """Decode every array, also where the manifest vouches for the bytes."""
@@ -366,18 +404,18 @@ def _verify(args: _Verify) -> None:
 
 @app.command(name="lint")
 def _lint(
-    path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set (path or id) or run")],
+    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set (path or id) or run")],
 ) -> None:
     """Is it what it says it is? Look for duplicates, gaps, jumps; exit with 1 on findings."""
-    place = locate(path)
+    path = locate(path)
     _finish(
-        place, [str(finding) for finding in wt.lint(place, console=console)], "nothing suspicious"
+        path, [str(finding) for finding in wt.lint(path, console=console)], "nothing suspicious"
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Repair:
-    path: tyro.conf.Positional[str]
+    path: tyro.conf.Positional[Path]
     """Data set (path or id) or run."""
     cut: bool = False
     """Drop damaged snapshots and those after them; collecting again makes them anew."""
@@ -395,7 +433,7 @@ def _repair(args: _Repair) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pack:
-    path: tyro.conf.Positional[str]
+    path: tyro.conf.Positional[Path]
     """Finished run."""
     profile: Literal["default", "archive"] = "default"
     """``default``: any Zarr v3 reader; ``archive``: smallest, lossless too, needs PCodec."""
@@ -412,7 +450,7 @@ def _pack(args: _Pack) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    path: tyro.conf.Positional[str | None] = None
+    path: tyro.conf.Positional[Path | None] = None
     """Data set (path or id) or run."""
     all: bool = False
     """A gallery: pages of all data sets that `list` shows, of models by their cards, an index."""
@@ -469,7 +507,7 @@ def _gallery(args: _Report) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Export:
-    path: tyro.conf.Positional[str]
+    path: tyro.conf.Positional[Path]
     """Run; for hdf5 also a data set."""
     to: Literal["hdf5", "npy", "safetensors", "sb3"]
     """hdf5: one file with everything; npy: weights.npy and tables; safetensors: one snapshot;
@@ -498,11 +536,11 @@ def _export(args: _Export) -> None:
 
 @app.command(name="import")
 def _import(
-    file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="HDF5 file of an export")],
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="HDF5 file of an export")],
     out: Annotated[Path, tyro.conf.arg(help="folder of the data set to be written")],
 ) -> None:
     """Make a data set of an HDF5 file that `export` wrote; every digest is checked."""
-    print(wt.open(wt.import_hdf5(here(file), out)))
+    print(wt.open(wt.import_hdf5(file, out)))
 
 
 @app.command(name="cache")
@@ -545,6 +583,9 @@ def main() -> None:
     """Run the command line; errors of ours are printed without a traceback."""
     try:
         with while_read():
+            if sys.argv[1:] == ["--version"]:
+                print(f"weighttraj {wt.__version__}")
+                return
             app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
     except (WeightTrajError, OSError) as error:
         errors.print(f"[red]error:[/red] {escape(str(error))}")

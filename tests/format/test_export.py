@@ -17,7 +17,8 @@ import weighttraj as wt
 from tests.format.test_store import LAYOUT, weights, write
 from weighttraj.errors import DamageError, StoreExistsError
 from weighttraj.format import ParamLayout, RunInfo, RunWriter
-from weighttraj.format.export import PIECE_BYTES, appearing, export_npy, export_safetensors
+from weighttraj.format.export import appearing, export_npy, export_safetensors
+from weighttraj.format.reader import PIECE_BYTES
 from weighttraj.format.schema import to_json
 
 

@@ -110,3 +110,18 @@ def test_runs_are_opened_when_they_are_used(small_dataset: Path, tmp_path: Path)
     assert len(ds["seed0001"]) == 49
     with pytest.raises(DamageError, match="no whole zip file"):
         len(ds["seed0000"])
+
+
+def test_a_run_opens_as_a_data_set_of_one_run(small_dataset: Path, tmp_path: Path) -> None:
+    packed = Path(shutil.copy(small_dataset / "runs/seed0000.zarr.zip", tmp_path / "r.zarr.zip"))
+    for path in (packed, tmp_path / "r.zarr", f"file://{packed}"):
+        found = wt.open(path)
+        assert [run.id for run in found] == ["seed0000"]
+        assert (found.info.id, found.info.status) == ("seed0000", "complete")
+        assert found.runs[0].weights.shape == (49, 122)
+
+
+def test_a_folder_that_holds_a_data_set_in_data_opens(small_dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(small_dataset, tmp_path / "mine/data")
+    assert wt.open(tmp_path / "mine").path == tmp_path / "mine/data"
+    assert len(wt.open(tmp_path / "mine")) == 4

@@ -12,9 +12,9 @@ import pytest
 
 import weighttraj as wt
 from weighttraj.errors import DamageError
+from weighttraj.format import reader
 from weighttraj.format.packing import pack
 from weighttraj.load import CachedWeights, CacheError, cache_folder, cache_size, clear_cache
-from weighttraj.load import cache as module
 
 ROOT = Path(__file__).parents[2]
 HEADER = 128
@@ -64,7 +64,7 @@ def test_an_entry_is_made_once_and_read_from_then_on(run: wt.Run) -> None:
 
 
 def test_a_run_is_decoded_in_pieces(wide_run: wt.Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PIECE_BYTES", 1 << 20)
+    monkeypatch.setattr(reader, "PIECE_BYTES", 1 << 20)
     sizes = [len(piece) for piece in CachedWeights(wide_run)._pieces()]
     assert sizes == [HEADER, *[8 * 80_000] * 37, 4 * 80_000]
     assert np.array_equal(CachedWeights(wide_run).map(), wide_run.weights[:])
@@ -202,8 +202,9 @@ def test_a_process_killed_by_hand_leaves_no_entry(wide_run: wt.Run, cache: Path)
 KILLED_WHEN_IT_WRITES = """
 import os, signal, sys
 import weighttraj as wt
+from weighttraj.format import reader
 from weighttraj.load import CachedWeights, cache
-cache.PIECE_BYTES = 1
+reader.PIECE_BYTES = 1
 def kill_at(frame, event, arg):
     if frame.f_code.co_name == "_write" and frame.f_locals["file"].tell() > 10_000_000:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -389,3 +389,8 @@ def test_seeds_without_complete_runs_are_refused(small_dataset: Path, tmp_path: 
     assert not (tmp_path / "part").exists()
     done = shell("weighttraj", "select", small_dataset, "--seeds", "0", "--out", tmp_path / "part")
     assert "1 of 4 runs of the whole" in done.stdout
+
+
+def test_create_with_a_string_instead_of_a_list_says_so() -> None:
+    with pytest.raises(RegistryError, match=r"(?s)wrong order.*expected: create\("):
+        create("out", "run0.zarr")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,6 +21,9 @@ from weighttraj.format.schema import ArraySpec, Profile
 MAX_CHUNK_PARAMS = 16_384
 """Columns in a chunk. While a run is collected, wider arrays are sharded: one file a block."""
 
+MAX_PARTS = 64
+"""Chunks that one row is cut into, about: the chunks of larger rows have more columns."""
+
 MAX_NARROW = 1024
 """Parameters up to which a packed chunk is transposed: a tenth smaller, where reading it is fast
 anyway. Larger policies would decode at half the speed."""
@@ -28,8 +31,18 @@ anyway. Larger policies would decode at half the speed."""
 PACKED_CHUNK_BYTES = 4 << 20
 """Decoded bytes in a chunk of a packed run, about."""
 
-MAX_CHUNK_BYTES = 1 << 30
-"""Decoded bytes in a chunk that a reader accepts: more could be there to fill the memory."""
+BLOCK_BYTES = MAX_PARTS * PACKED_CHUNK_BYTES
+"""Decoded bytes of the rows that a writer keeps in memory and commits together: 256 MiB. A single
+row may be larger."""
+
+MAX_CHUNK_BYTES = (1 << 31) - 1
+"""Decoded bytes in a chunk, at most: Blosc cannot hold more."""
+
+FREE_CHUNK_BYTES = 1 << 30
+"""Decoded bytes up to which a reader accepts a chunk however small its object is."""
+
+MAX_RATIO = 256
+"""Decoded bytes for each stored byte of a larger chunk, at most; LZ4 reaches 255."""
 
 PLAIN = {"name": "bytes", "configuration": {"endian": "little"}}
 """The codec of numbers as they are in memory."""
@@ -56,19 +69,18 @@ def create_array(
     if packed_rows is None:
         profile = "default"  # until the run is packed
     by_column = profile == "archive" and len(spec.inner) == 1 and spec.dtype != "uint8"
-    if packed_rows is None:
-        rows, columns = block, spec.inner
-    else:
-        rows, columns = _packed_chunk(spec, packed_rows, by_column)
-    chunks: tuple[int, ...] = (rows, *columns)
     shards: ShardsConfigParam | None = None
-    if packed_rows is None and len(spec.inner) == 1 and spec.inner[0] > MAX_CHUNK_PARAMS:
-        chunks = (block, MAX_CHUNK_PARAMS)
-        width = -(-spec.inner[0] // MAX_CHUNK_PARAMS) * MAX_CHUNK_PARAMS
-        # The index comes first: plain HTTP servers answer no request for a suffix.
-        shards = ShardsConfigParam(
-            shape=(block, width), index_location=ShardingCodecIndexLocation.start
-        )
+    if packed_rows is not None:
+        chunks = _packed_chunk(spec, packed_rows, by_column)
+    else:
+        part = part_of_row(spec.inner, MAX_CHUNK_PARAMS)
+        chunks = (block, *part)
+        if part != spec.inner:
+            widths = (-(-n // c) * c for n, c in zip(spec.inner, part, strict=True))
+            # The index comes first: plain HTTP servers answer no request for a suffix.
+            shards = ShardsConfigParam(
+                shape=(block, *widths), index_location=ShardingCodecIndexLocation.start
+            )
     shape, dims = (0, *spec.inner), spec.dims
     if by_column:  # PCodec sees no strides: the order must be the array's own
         shape, dims, chunks = shape[::-1], dims[::-1], chunks[::-1]
@@ -113,9 +125,12 @@ def check_array(spec: ArraySpec, document: Any, rows: int, where: str) -> None:
             == {"name": "default", "configuration": {"separator": "/"}}
             and not document.get("storage_transformers")
         )
-        size = math.prod(inner) * np.dtype(spec.dtype).itemsize
-        small = size <= MAX_CHUNK_BYTES and min(spec.inner, default=1) > 0
-        small = small and _divides(inner, [0] * len(shape)) and _shards_fit(document, inner)
+        small = min(spec.inner, default=1) > 0 and _divides(inner, [0] * len(shape))
+        small = small and _shards_fit(document, inner)
+        # A shard may have any size: its chunks are decoded one by one.
+        chunk = unshard(document["codecs"], tuple(inner))[1] if small else ()
+        size = math.prod(chunk) * np.dtype(spec.dtype).itemsize
+        small = small and size <= MAX_CHUNK_BYTES
         unknown = sorted(set(_codec_names(document["codecs"])) - KNOWN_CODECS)
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         if isinstance(error, FormatError):
@@ -135,6 +150,45 @@ def check_array(spec: ArraySpec, document: Any, rows: int, where: str) -> None:
             where=where,
             do="do not use data from a source that you do not trust",
         )
+
+
+def rows_in_block(specs: Iterable[ArraySpec], block: int) -> int:
+    """Return how many rows a writer commits together: fewer than ``block`` if rows are large.
+
+    So the rows of the arrays stay within ``BLOCK_BYTES``, except that one row may be larger.
+
+    Args:
+        specs: arrays that are written together.
+        block: rows that the user asked for.
+    """
+    return max(1, min(block, BLOCK_BYTES // max(1, sum(map(row_bytes, specs)))))
+
+
+def row_bytes(spec: ArraySpec) -> int:
+    """Return the decoded bytes of one row of an array."""
+    return math.prod(spec.inner) * np.dtype(spec.dtype).itemsize
+
+
+def part_of_row(inner: tuple[int, ...], most: int) -> tuple[int, ...]:
+    """Return the shape of the parts that a row is cut into: last axes whole, if they fit.
+
+    Args:
+        inner: shape of a row.
+        most: elements of a part; more where a row would have more than ``MAX_PARTS`` parts.
+
+    >>> part_of_row((40_000,), 16_384), part_of_row((64, 84, 84, 4), 16_384)
+    ((16384,), (1, 84, 84, 4))
+    """
+    left, part = max(most, -(-math.prod(inner) // MAX_PARTS)), []
+    for n in reversed(inner):
+        part.append(max(1, min(n, left)))
+        left //= max(1, n)
+    return tuple(reversed(part))
+
+
+def explodes(decoded: int, encoded: int) -> bool:
+    """Return whether a chunk would decode to more bytes than an honest writer put into it."""
+    return decoded > max(FREE_CHUNK_BYTES, MAX_RATIO * encoded)
 
 
 def check_grid(document: dict[str, Any]) -> None:
@@ -178,14 +232,15 @@ def quiet_codecs() -> Iterator[None]:
         yield
 
 
-def _packed_chunk(spec: ArraySpec, rows: int, by_column: bool) -> tuple[int, tuple[int, ...]]:
-    """Rows and columns of a chunk of about 4 MiB; as many rows as fit."""
+def _packed_chunk(spec: ArraySpec, rows: int, by_column: bool) -> tuple[int, ...]:
+    """Shape of a chunk of about 4 MiB: as many rows as fit, all but large rows whole."""
     itemsize = np.dtype(spec.dtype).itemsize
-    columns = spec.inner
-    if len(columns) == 1:
-        columns = (min(columns[0], MAX_CHUNK_PARAMS // (2 if by_column else 1)),)
+    most = PACKED_CHUNK_BYTES // itemsize
+    if len(spec.inner) == 1:
+        most = MAX_CHUNK_PARAMS // (2 if by_column else 1)
+    columns = part_of_row(spec.inner, most)
     fitting = PACKED_CHUNK_BYTES // (itemsize * max(1, math.prod(columns)))
-    return max(1, min(rows, fitting)), columns
+    return max(1, min(rows, fitting)), *columns
 
 
 def _codecs(spec: ArraySpec, profile: Profile, *, packed: bool) -> dict[str, Any]:

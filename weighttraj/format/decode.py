@@ -17,11 +17,14 @@ import numpy as np
 from numcodecs import blosc
 
 from weighttraj.errors import DamageError, FormatError, MissingExtraError
-from weighttraj.format.codecs import PLAIN, unshard
+from weighttraj.format.codecs import BLOCK_BYTES, MAX_RATIO, PLAIN, explodes, unshard
 from weighttraj.format.objects import Objects, missing_object
 
 _MISSING = 2**64 - 1
-_OVERHEAD = 1 << 20  # bytes of an object beside its chunks, at most
+
+_WHOLE_BYTES = BLOCK_BYTES
+"""Stored bytes up to which a shard is read at once, while a writer may replace it. Larger ones hold
+a single row, or are old: their chunks are read one by one."""
 
 GROWING = "--------"
 """In place of the crc32c of a chunk that is not full while its run is collected."""
@@ -82,7 +85,7 @@ class RowDecoder:
             self._require(parts)
         out = self._empty(shape[::-1] if self._by_column else shape)
         target = out.T if self._by_column else out
-        scratch = self._empty((math.prod(self._chunk),))
+        scratch: np.ndarray | None = None
         self._objects.expect([self._key(index) for index in itertools.product(*parts)])
         for index in itertools.product(*parts):
             for corner, content in self._encoded(index, bounds):
@@ -97,6 +100,7 @@ class RowDecoder:
                     slice(a - o, b - o) for (a, b), (o, _) in zip(spans, bounds, strict=True)
                 )
                 data = self._checked(content, index, self._tag(corner))
+                scratch = self._memory(scratch, len(data), index)
                 target[place] = self._decode(data, scratch, index)[source]
         return out
 
@@ -125,32 +129,62 @@ class RowDecoder:
     def _require(self, parts: list[range]) -> None:
         """Every chunk must be there before memory for them is taken."""
         for index in grid(parts):
-            if not self._objects.exists(self._key(index)):
+            if self._objects.size(self._key(index)) is None:
                 raise self._missing(index)
 
     def _encoded(
         self, index: tuple[int, ...], bounds: list[tuple[int, int]]
     ) -> Iterator[tuple[tuple[int, ...], memoryview]]:
         """First element and bytes of each chunk in an object."""
-        decoded = math.prod(self._outer) * self._dtype.itemsize
-        content = self._objects.read(self._key(index), 0, 2 * decoded + _OVERHEAD)
-        if content is None:
-            raise self._missing(index)
         corner = tuple(i * c for i, c in zip(index, self._outer, strict=True))
         if not self._sharded:
-            yield corner, memoryview(content)
+            yield corner, memoryview(self._bytes(index))
             return
+        size = self._objects.size(self._key(index)) or 0
+        content = self._bytes(index) if size <= _WHOLE_BYTES else None
         counts = [o // c for o, c in zip(self._outer, self._chunk, strict=True)]
-        size = 16 * math.prod(counts)
-        table = np.frombuffer(self._checked(content[: size + 4], index), "<u8").reshape(-1, 2)
-        if int(table.sum(axis=1).max()) != len(content):
-            raise self._damaged(index, f"{len(content)} bytes, not what the shard's index says")
+        head = 16 * math.prod(counts) + 4
+        start = self._bytes(index, 0, head) if content is None else content[:head]
+        table = np.frombuffer(self._checked(start, index), "<u8").reshape(-1, 2)
+        size = size if content is None else len(content)
+        if len(table) != math.prod(counts) or int(table.sum(axis=1).max()) != size:
+            raise self._damaged(index, f"{size} bytes, not what the shard's index says")
         for place, (offset, length) in zip(np.ndindex(*counts), table.tolist(), strict=True):
             inner = tuple(k + i * c for k, i, c in zip(corner, place, self._chunk, strict=True))
-            if all(k < b for k, (_, b) in zip(inner, bounds, strict=True)):
+            ends = zip(inner, self._chunk, bounds, strict=True)
+            if all(k < b and k + c > a for k, c, (a, b) in ends):
                 if offset == _MISSING:
                     raise self._missing(index)
-                yield inner, memoryview(content)[offset : offset + length]
+                if content is None:
+                    yield inner, memoryview(self._bytes(index, offset, offset + length))
+                else:
+                    yield inner, memoryview(content)[offset : offset + length]
+
+    def _bytes(self, index: tuple[int, ...], start: int = 0, stop: int | None = None) -> bytes:
+        """The bytes of an object that must be there, or some of them."""
+        content = self._objects.read(self._key(index), start, stop)
+        if content is None:
+            raise self._missing(index)
+        return content
+
+    def _memory(
+        self, memory: np.ndarray | None, encoded: int, index: tuple[int, ...]
+    ) -> np.ndarray:
+        """Return memory for one decoded chunk: that of the last one, if there was one.
+
+        Raises:
+            FormatError: the chunk asks for far more memory than its bytes can fill.
+        """
+        size = math.prod(self._chunk)
+        if explodes(size * self._dtype.itemsize, encoded):
+            raise FormatError(
+                "refused: a chunk asks for more memory than its bytes can fill",
+                expected=f"at most {MAX_RATIO} bytes for each of the {encoded} stored ones",
+                got=f"{size * self._dtype.itemsize} bytes",
+                where=f"{self._objects.path}, {self._key(index)}",
+                do="do not use data from a source that you do not trust",
+            )
+        return self._empty((size,)) if memory is None else memory
 
     def _decode(self, data: bytes, scratch: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
         shape = self._chunk[::-1] if self._transposed else self._chunk

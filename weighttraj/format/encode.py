@@ -38,7 +38,7 @@ class ObjectEncoder:
         codecs, self._chunk, self._sharded = unshard(document["codecs"], outer)
         kinds = [codec["name"] for codec in codecs]
         transposed = document["dimension_names"][0] != spec.axis
-        if kinds != ["bytes", "blosc", "crc32c"] or transposed or len(spec.inner) > 2:
+        if kinds != ["bytes", "blosc", "crc32c"] or transposed:
             raise NotImplementedError(kinds)
         self._blosc = codecs[1]["configuration"]
         self._counts = tuple(o // c for o, c in zip(outer, self._chunk, strict=True))
@@ -56,14 +56,14 @@ class ObjectEncoder:
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f".{path.name}.draft")
-        starts = [i * self._chunk[1] for i in range(self._counts[1])] if self._sharded else [0]
-        head = 16 * len(starts) + 4 if self._sharded else 0
+        places = list(np.ndindex(*self._counts[1:]))
+        head = 16 * len(places) + 4 if self._sharded else 0
         table: list[tuple[int, int]] = []
         tags: list[str] = []
         with draft.open("wb") as file:
             file.seek(head)
-            for start in starts:
-                data = self._encode(rows, start)
+            for place in places:
+                data = self._encode(rows, place)
                 table.append((file.tell(), len(data)))
                 tags.append(data[-4:].hex())
                 file.write(data)
@@ -84,14 +84,14 @@ class ObjectEncoder:
                 )
         return "".join(tags)
 
-    def _encode(self, rows: Sequence[np.ndarray] | np.ndarray, column: int) -> bytes:
+    def _encode(self, rows: Sequence[np.ndarray] | np.ndarray, place: tuple[int, ...]) -> bytes:
+        """Encode one chunk: a part of each row."""
         chunk = np.full(self._chunk, self._spec.fill, self._spec.dtype)
-        if len(self._chunk) == 2:
-            width = min(self._chunk[1], self._spec.inner[0] - column)
-            for target, row in zip(chunk, rows, strict=False):
-                target[:width] = row[column : column + width]
-        else:
-            chunk[: len(rows)] = np.stack(list(rows))
+        spans = list(zip(place, self._chunk[1:], self._spec.inner, strict=True))
+        part: tuple[Any, ...] = tuple(slice(i * c, min((i + 1) * c, n)) for i, c, n in spans)
+        corner: tuple[Any, ...] = tuple(slice(s.stop - s.start) for s in part)
+        for i, row in enumerate(rows):
+            chunk[i, *corner] = row[part]
         settings = self._blosc
         shuffle = _SHUFFLES[settings["shuffle"]]
         data: bytes = blosc.compress(

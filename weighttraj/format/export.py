@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
-import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator
@@ -19,9 +18,6 @@ from weighttraj.errors import missing_extra
 from weighttraj.format.objects import refuse_existing, sync
 from weighttraj.format.reader import Run, StoredArray
 from weighttraj.format.schema import to_json
-
-PIECE_BYTES = 64 << 20
-"""Bytes of an array that are copied at a time, about; one row at least."""
 
 
 @contextlib.contextmanager
@@ -125,21 +121,13 @@ def export_safetensors(run: Run, t: int, path: str | Path) -> Path:
     return path
 
 
-def pieces(array: StoredArray, unit: int = 1) -> Iterator[tuple[int, np.ndarray]]:
-    """The rows of an array, some at a time: (first row, rows), a multiple of ``unit`` in each."""
-    row = array.dtype.itemsize * max(1, math.prod(array.shape[1:]))
-    step = unit * max(1, PIECE_BYTES // (unit * row))
-    for start in range(0, len(array), step):
-        yield start, array[start : start + step]
-
-
 def _write_npy(file: Path, array: StoredArray) -> None:
     dtype = array.dtype.newbyteorder("<")
     if 0 in array.shape:  # there is nothing to map
         np.save(file, np.empty(array.shape, dtype))
         return
     target = np.lib.format.open_memmap(file, "w+", dtype, array.shape)
-    for start, rows in pieces(array):
+    for start, rows in array.pieces():
         target[start : start + len(rows)] = rows
     target.flush()
 
@@ -167,4 +155,4 @@ def _remove(draft: Path) -> None:
         draft.unlink(missing_ok=True)
 
 
-__all__ = ["appearing", "export_npy", "export_safetensors", "pieces"]
+__all__ = ["appearing", "export_npy", "export_safetensors"]

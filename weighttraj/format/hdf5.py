@@ -9,7 +9,6 @@ nothing is added to it, and it is no format to collect in.
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -31,8 +30,8 @@ from weighttraj.format.catalog import (
     parse_dataset,
     write_dataset_info,
 )
-from weighttraj.format.codecs import PACKED_CHUNK_BYTES
-from weighttraj.format.export import appearing, pieces
+from weighttraj.format.codecs import PACKED_CHUNK_BYTES, part_of_row, row_bytes
+from weighttraj.format.export import appearing
 from weighttraj.format.hdf5_store import (
     MAX_METADATA_BYTES,
     RUN,
@@ -46,11 +45,10 @@ from weighttraj.format.integrity import seal
 from weighttraj.format.live import LiveStore
 from weighttraj.format.objects import check_name
 from weighttraj.format.packing import pack
-from weighttraj.format.reader import Dataset, Run, StoredArray, open_dataset, open_run
+from weighttraj.format.reader import Dataset, Run, StoredArray, info_of_one, open_dataset
 from weighttraj.format.schema import (
     ArraySpec,
     DatasetInfo,
-    RunEntry,
     arrays_of,
     to_json,
     with_progress,
@@ -89,7 +87,7 @@ def export_hdf5(source: Dataset | Run | str | Path, out: str | Path) -> Path:
                 _put_run(root.create_group(f"runs/{run.id}"), run)
         for run in open_hdf5(draft):
             for array in run.arrays.values():
-                for _ in pieces(array):
+                for _ in array.pieces():
                     pass  # reading is checking
     return out
 
@@ -163,16 +161,9 @@ def open_hdf5(path: str | Path) -> Dataset:
 def _contents(source: Dataset | Run | str | Path) -> tuple[list[Run], DatasetInfo]:
     """The runs to be exported, and the list of them."""
     if isinstance(source, str | Path):
-        one = not (Path(source) / DATASET).is_file()
-        source = open_run(source) if one else open_dataset(source)
+        source = open_dataset(source)
     if isinstance(source, Run):
-        info, packed = source.info, source.path.name.endswith(PACKED)
-        path = f"runs/{info.run_id}.zarr{PACKED if packed else ''}"
-        return [source], DatasetInfo(
-            id=info.run_id,
-            runs=(RunEntry(id=info.run_id, path=path, seed=info.seed),),
-            status="complete" if info.status == "complete" else "collecting",
-        )
+        return [source], info_of_one(source)
     listed = source.info
     if listed.status == "complete":  # else it lists runs that it does not have yet
         chosen = {run.id for run in source}
@@ -206,7 +197,7 @@ def _put_array(group: h5py.Group, spec: ArraySpec, array: StoredArray) -> dict[s
     for axis, name in enumerate(spec.dims):
         stored.dims[axis].label = name
     hashes = []
-    for start, values in pieces(array, rows):
+    for start, values in array.pieces(rows):
         stored[start : start + len(values)] = values
         hashes += [sha256(values[i : i + rows]) for i in range(0, len(values), rows)]
     return {"rows": rows, "sha256": hashes}
@@ -217,11 +208,8 @@ def _chunk(spec: ArraySpec, n: int) -> tuple[int, tuple[int, ...]]:
 
     Rows are not cut as they are in Zarr: a block is checked as a whole, so it must be small.
     """
-    itemsize = np.dtype(spec.dtype).itemsize
-    columns = spec.inner
-    if len(columns) == 1:
-        columns = (min(columns[0], PACKED_CHUNK_BYTES // itemsize),)
-    return max(1, min(n, PACKED_CHUNK_BYTES // (itemsize * max(1, math.prod(spec.inner))))), columns
+    rows = max(1, min(n, PACKED_CHUNK_BYTES // max(1, row_bytes(spec))))
+    return rows, part_of_row(spec.inner, PACKED_CHUNK_BYTES // np.dtype(spec.dtype).itemsize)
 
 
 def _put_document(group: h5py.Group, name: str, content: bytes) -> None:
@@ -241,8 +229,9 @@ def _import_run(run: Run, path: Path) -> None:
     folder = path.with_name(path.name.removesuffix(PACKED))
     start = with_progress(info, status=info.status, time=0, iteration=0)
     live = LiveStore.create(folder, start)
+    info = replace(info, block=live.info.block)
     for name, array in run.arrays.items():
-        for first, values in pieces(array, live.chunk_rows(name)):
+        for first, values in array.pieces(live.chunk_rows(name)):
             live.write(name, first, values)
     live.commit(info)
     if folder != path:

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from weighttraj.errors import DamageError, FormatError, WeightTrajError
-from weighttraj.format.codecs import MAX_CHUNK_BYTES
+from weighttraj.format.codecs import FREE_CHUNK_BYTES
 from weighttraj.format.objects import check_name
 from weighttraj.format.schema import ArraySpec, RunInfo, arrays_of, load_json, parse
 from weighttraj.format.storage import ATTRIBUTE, checksum
@@ -108,6 +108,10 @@ class H5RunStore:
                 where=f"{self.path}, array {name!r}",
                 do="read fewer rows at a time",
             ) from error
+
+    def chunk_rows(self, name: str) -> int:
+        """Rows of an array that are decoded together."""
+        return self._blocks[name].rows
 
     def _read(self, spec: ArraySpec, rows: Any, columns: tuple[Any, ...]) -> np.ndarray:
         if isinstance(rows, slice):
@@ -237,14 +241,14 @@ def _parse(document: Any, where: str) -> tuple[RunInfo, dict[str, Blocks]]:
         for name, spec in arrays_of(info).items():
             rows, n = blocks[name].rows, info.committed(spec.axis)
             size = rows * math.prod(spec.inner) * np.dtype(spec.dtype).itemsize
-            if rows < 1 or (rows > 1 and size > MAX_CHUNK_BYTES):
+            if rows < 1 or (rows > 1 and size > FREE_CHUNK_BYTES):
                 raise ValueError(f"{name}: blocks of {rows} rows, {size} bytes")
             if len(blocks[name].sha256) != -(-n // rows):
                 raise ValueError(f"{name}: {len(blocks[name].sha256)} blocks for {n} rows")
     except (msgspec.ValidationError, KeyError, ValueError) as error:
         raise FormatError(
             "the blocks of an array are not what the run's metadata says",
-            expected=f"hashes of all blocks, of one row or at most {MAX_CHUNK_BYTES} bytes each",
+            expected=f"hashes of all blocks, of one row or at most {FREE_CHUNK_BYTES} bytes each",
             got=error,
             where=where,
             do=_DISTRUST,
@@ -264,11 +268,11 @@ def _checked_array(
     if (
         not chunked
         or filters - _FILTERS.keys()
-        or math.prod(plist.get_chunk()) * itemsize > MAX_CHUNK_BYTES
+        or math.prod(plist.get_chunk()) * itemsize > FREE_CHUNK_BYTES
     ):
         raise FormatError(
             "refused: an array is stored in a way that this format does not have",
-            expected=f"chunks of at most {MAX_CHUNK_BYTES} bytes in the file itself, filters "
+            expected=f"chunks of at most {FREE_CHUNK_BYTES} bytes in the file itself, filters "
             f"among {sorted(_FILTERS.values())}",
             got=f"filters {sorted(filters)}, chunks {plist.get_chunk() if chunked else None}",
             where=where,

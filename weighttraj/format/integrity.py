@@ -25,6 +25,7 @@ from weighttraj.format.catalog import (
     write_dataset_info,
     write_manifest,
 )
+from weighttraj.format.codecs import rows_in_block
 from weighttraj.format.fit import find_misfit
 from weighttraj.format.live import LiveStore
 from weighttraj.format.objects import ZipObjects, sync
@@ -228,15 +229,18 @@ def _is_earlier(store: RunStore, name: str, content: bytes) -> bool:
 
 def _verify_array(name: str, array: StoredArray, *, where: str) -> Iterator[str]:
     last = None
-    for start in range(0, len(array), 512):
-        rows = array[start : start + 512]
-        if name == "policy/weights" and not np.isfinite(rows).all():
-            yield f"{where}, {name}: not finite between rows {start} and {start + 512}"
+    for start, rows in array.pieces():
+        if name == "policy/weights" and (bad := [i for i, r in enumerate(rows) if not _finite(r)]):
+            yield f"{where}, {name}: not finite at row {start + bad[0]}"
         if name in MONOTONE:
             steps = np.diff(rows, prepend=rows[:1] if last is None else last)
             if (steps < 0).any():
                 yield f"{where}, {name}: goes back at row {start + int(np.argmax(steps < 0))}"
             last = rows[-1:]
+
+
+def _finite(row: np.ndarray) -> bool:
+    return bool(np.isfinite(row).all())
 
 
 def _chunk_keys(store: RunStore, name: str) -> Iterator[str]:
@@ -368,11 +372,12 @@ def _whole_rows(store: RunStore, axis: Axis) -> int:
     """Rows before the first damaged one, in whole blocks; returns can be got again."""
     n, block = store.info.committed(axis), store.info.block
     specs = [s for s in store.specs.values() if s.axis == axis and s.name not in RETURNS]
-    arrays = {s.name: StoredArray(store, s) for s in specs}
     for start in range(0, n, block):
         try:
-            for array in arrays.values():
-                array[start : start + block]
+            for spec in specs:
+                step = rows_in_block([spec], block)  # old blocks of large rows are larger
+                for first in range(start, min(start + block, n), step):
+                    StoredArray(store, spec)[first : min(first + step, start + block)]
         except DamageError:
             return start
     return n

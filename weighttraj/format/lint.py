@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from weighttraj.remote.address import here
 
 JUMP = 30.0
 """A step is a discontinuity if it is so many times the median of the steps around it."""
+
+_COLUMNS = 1 << 20
 
 AROUND = 25
 """Steps before and after that a step is compared with."""
@@ -117,23 +120,33 @@ def _counters(run: Run) -> Iterator[tuple[str, str]]:
 def _weights(run: Run) -> Iterator[tuple[str, str]]:
     first = run.weights[0]
     moved = np.zeros(first.shape, bool)
-    lengths, bad, last = [], [], first[None].astype(np.float64)
-    for start in range(0, len(run), 512):
-        rows = run.weights[start : start + 512]
-        moved |= (rows != first).any(axis=0)
-        bad += (start + np.flatnonzero(~np.isfinite(rows).all(axis=1))).tolist()
-        steps = np.diff(rows.astype(np.float64), axis=0, prepend=last)
-        lengths.append(np.linalg.norm(steps, axis=1))
-        last = rows[-1:].astype(np.float64)
+    lengths, bad, last = [], [], first
+    for start, rows in run.weights.pieces():
+        for t, row in enumerate(rows, start):
+            moved |= row != first
+            bad += [] if np.isfinite(row).all() else [t]
+            lengths.append(_distance(row, last))
+            last = row
+        last = last.copy()  # the piece need not stay in memory
     if bad:
         yield "finite", f"NaN or infinite weights at {_some(bad)}"
     if len(run) > 1 and not moved.all():
         names = [s.name for s in run.layout.params if not moved[s.slice].all()]
         still = int((~moved).sum())
         yield "constant", f"{still} of {moved.size} parameters never change, in {names}"
-    jumps = _jumps(np.concatenate(lengths)[1:])
+    jumps = _jumps(np.array(lengths)[1:])
     if jumps:
         yield "jump", f"steps {JUMP:g} times longer than those around them end at {_some(jumps)}"
+
+
+def _distance(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the L2 distance of two snapshots in float64, some parameters at a time."""
+    total = 0.0
+    for start in range(0, len(one), _COLUMNS):
+        part = slice(start, start + _COLUMNS)
+        with np.errstate(invalid="ignore"):  # infinite weights are a finding of their own
+            total += float(((one[part].astype(np.float64) - other[part]) ** 2).sum())
+    return math.sqrt(total)
 
 
 def _jumps(lengths: np.ndarray) -> list[int]:

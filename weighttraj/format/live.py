@@ -7,7 +7,8 @@ import copy
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,10 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
 from weighttraj.errors import DamageError, FormatError, MissingExtraError
-from weighttraj.format.codecs import create_array, quiet_codecs
+from weighttraj.format.codecs import create_array, quiet_codecs, rows_in_block
 from weighttraj.format.encode import ObjectEncoder
 from weighttraj.format.objects import FolderObjects, refuse_existing, replace_file, sync
-from weighttraj.format.schema import RunInfo, arrays_of
+from weighttraj.format.schema import AXES, RunInfo, arrays_of
 from weighttraj.format.storage import (
     PACKED,
     Documents,
@@ -38,6 +39,8 @@ from weighttraj.remote.address import Place
 
 # Chunks of fill values are written too. Zarr 3.1 ignores `config=` of open_array: set it here.
 _EMPTY_CHUNKS = {"array.write_empty_chunks": True}
+
+_SLAB_BYTES = 32 << 20
 
 
 class LiveStore(RunStore):
@@ -69,8 +72,11 @@ class LiveStore(RunStore):
 
         Raises:
             StoreExistsError: the path exists.
+            FormatError: readers would refuse a run that is described so.
         """
         refuse_existing(path, "choose another path, delete it, or continue with resume=True")
+        if packed_rows is None:
+            info = replace(info, block=_block(info))
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
         shutil.rmtree(draft, ignore_errors=True)
@@ -78,6 +84,7 @@ class LiveStore(RunStore):
         tags = dict.fromkeys(documents, "")
         store = cls(FolderObjects(draft), Metadata(info=info, documents=documents, tags=tags))
         store.commit(info)
+        _check_readable(store)
         draft.rename(path)
         sync(path.parent)
         store.objects = FolderObjects(path)
@@ -151,24 +158,36 @@ class LiveStore(RunStore):
         if name not in self._writable:
             store = _BlockStore(self.path, name, self.documents[name])
             self._writable[name] = _open_array(store, name, "r+", str(self.path))
-        array = self._writable[name]
+        array, by_column = self._writable[name], self._by_column(name)
         stop = start + len(values)
-        values = np.ascontiguousarray(values, array.dtype)
-        rows: Any = slice(start, stop)
-        if self._by_column(name):
-            if array.shape[1] < stop:
-                array.resize((array.shape[0], stop))
-            rows = (slice(None), rows)
-            values = np.ascontiguousarray(values.T)
-        elif array.shape[0] < stop:
-            array.resize((stop, *array.shape[1:]))
-        array[rows] = values
-        if np.asarray(array[rows]).tobytes() != values.tobytes():
-            raise DamageError(
-                "what was written reads back as something else",
-                where=f"{self.path}, array {name!r}, rows {start} to {stop}",
-                do="check the disk; nothing of this block was committed",
-            )
+        axis = 1 if by_column else 0
+        if array.shape[axis] < stop:
+            array.resize(tuple(stop if i == axis else n for i, n in enumerate(array.shape)))
+        for columns in self._slabs(name, values):
+            # PCodec sees no strides: the order must be the array's own.
+            part = values[:, *columns].T if by_column else values[:, *columns]
+            part = np.ascontiguousarray(part, array.dtype)
+            place = (*columns, slice(start, stop)) if by_column else (slice(start, stop), *columns)
+            array[place] = part
+            if np.asarray(array[place]).tobytes() != part.tobytes():
+                raise DamageError(
+                    "what was written reads back as something else",
+                    where=f"{self.path}, array {name!r}, rows {start} to {stop}",
+                    do="check the disk; nothing of this block was committed",
+                )
+
+    def _slabs(self, name: str, values: np.ndarray) -> Iterator[tuple[slice, ...]]:
+        """Columns of whole chunks that Zarr writes at a time: it holds ten times as much."""
+        inner = self.specs[name].inner
+        if not inner:
+            yield ()
+            return
+        chunk = self.documents[name]["chunk_grid"]["configuration"]["chunk_shape"]
+        width = chunk[0] if self._by_column(name) else chunk[1]
+        column = values.nbytes // max(1, inner[0])
+        step = max(1, _SLAB_BYTES // max(1, column * width)) * width
+        for first in range(0, inner[0], step):
+            yield (slice(first, min(first + step, inner[0])),)
 
     def commit(self, info: RunInfo) -> None:
         """Make the metadata, and with it the committed rows, visible in one atomic replace.
@@ -218,10 +237,10 @@ class LiveStore(RunStore):
         """Files and folders that hold some rows of an array."""
         folder = self.path / name
         if not self._by_column(name):
-            size, inner = self.chunk_rows(name), "/0" * len(self.specs[name].inner)
-            chunks = range(start // size, -(-stop // size))
-            files = [folder / f"c/{chunk}{inner}" for chunk in chunks]
-            files = [file for file in files if file.exists()]
+            size = self.chunk_rows(name)
+            chunks = [folder / f"c/{i}" for i in range(start // size, -(-stop // size))]
+            files = [file for chunk in chunks for file in (chunk, *chunk.rglob("*"))]
+            files = [file for file in files if file.is_file()]
         else:
             files = [file for file in folder.rglob("*") if file.is_file()]
         root = len(self.path.parts)
@@ -230,6 +249,30 @@ class LiveStore(RunStore):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_writable": {}, "_encoders": {}}
+
+
+def _block(info: RunInfo) -> int:
+    """Return the snapshots in one commit: fewer than the user asked for if they are large."""
+    specs = arrays_of(info).values()
+    return min(rows_in_block([s for s in specs if s.axis == a], info.block) for a in AXES)
+
+
+def _check_readable(store: LiveStore) -> None:
+    """Open a new store as readers do, before the training that it is made for begins.
+
+    Raises:
+        FormatError: readers would refuse it.
+    """
+    try:
+        read_metadata(store.objects)
+    except FormatError as error:
+        shutil.rmtree(store.path, ignore_errors=True)
+        raise FormatError(
+            "a run that is described so could not be read",
+            got=error,
+            where=store.path,
+            do="describe the run by plain, finite values; nothing was written",
+        ) from error
 
 
 def empty_arrays(

@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from weighttraj.remote.address import Place, here
+from weighttraj.remote.address import RemotePath, is_remote
 
 VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
 """Environment variable: folders that hold data sets, as in PATH."""
@@ -15,12 +15,14 @@ HOME = "~/.weighttraj/datasets"
 COLLECTED = "data"
 """Where data sets are collected, below the working directory."""
 
-_ID = re.compile(r"([^/\0.][^/\0]{0,199}/)?[^/\0.][^/\0]{0,199}")
-"""What can be an id here: the name of a folder, or of one in another, that is not hidden."""
+_ID = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,127}/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
-def locate(path: str | Place) -> Path:
-    """The path of a data set: the path itself, or where the data set of an id lies.
+def locate(path: str | Path) -> Path:
+    """Return the path of a data set: the path itself, or where the data set of an id lies.
+
+    A folder that is no data set but holds one in ``data``, as ``datasets/<id>`` of a clone does,
+    stands for that one.
 
     An id, with a namespace or without, is looked for in the folders of
     ``WEIGHTTRAJ_DATASETS_PATH``, or else in ``~/.weighttraj/datasets``, then in ``datasets`` of the
@@ -32,9 +34,12 @@ def locate(path: str | Place) -> Path:
         RegistryError: it is an address, and what is asked for needs files on this machine.
     """
     name = str(path)
-    path = here(path)
-    if path.exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
-        return path
+    if is_remote(name):
+        os.fspath(RemotePath.parse(name))  # raises, and says how to have it here
+    if Path(path).exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
+        inner = Path(path) / "data"
+        outer = (Path(path) / "dataset.json").is_file() or (Path(path) / "zarr.json").is_file()
+        return inner if not outer and (inner / "dataset.json").is_file() else Path(path)
     places = [folder / name / part for folder in folders() for part in ("", "data")]
     for place in places:
         if (place / "dataset.json").is_file():
@@ -44,6 +49,13 @@ def locate(path: str | Place) -> Path:
         f"no data set or run at {name}, and none of that id in {looked}; "
         f"set {VARIABLE} to the folders that hold your data sets"
     )
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a run lies at a path: a folder, a packed file, or a folder that was packed."""
+    packed = path.with_name(f"{path.name}.zip") if path.name else path
+    named = path.name.endswith(".zarr") and packed.is_file() and not path.exists()
+    return path.is_file() or (path / "zarr.json").is_file() or named
 
 
 def folders() -> list[Path]:
@@ -60,4 +72,4 @@ def clone() -> Path | None:
     return place if place.is_dir() else None
 
 
-__all__ = ["COLLECTED", "HOME", "VARIABLE", "clone", "folders", "locate"]
+__all__ = ["COLLECTED", "HOME", "VARIABLE", "clone", "folders", "is_run", "locate"]

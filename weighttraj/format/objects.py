@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from weighttraj.errors import DamageError, FormatError, StoreExistsError, WeightTrajError
-from weighttraj.remote.address import Place, new_path
+from weighttraj.remote.address import Place
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
 _PIECE_BYTES = 4 << 20
 
-MAX_DIRECTORY = 64 << 20
-"""Bytes of a zip file's directory, at most: half a million members."""
 MAX_NAME = 200
 """Characters between two slashes of a name: file systems take 255, drafts have longer ones."""
 
@@ -42,8 +40,8 @@ class Objects(Protocol):
         Returns None if there is no such object.
         """
 
-    def exists(self, name: str) -> bool:
-        """Whether there is such an object."""
+    def size(self, name: str) -> int | None:
+        """Bytes of an object; None: there is no such object."""
 
     def expect(self, names: Sequence[str]) -> None:
         """These will be read next, in this order: what is far away fetches them together."""
@@ -120,9 +118,13 @@ class FolderObjects:
         finally:
             os.close(handle)
 
-    def exists(self, name: str) -> bool:
+    def size(self, name: str) -> int | None:
         """See ``Objects``."""
-        return os.path.isfile(self.file(name))
+        try:
+            status = os.stat(self.file(name))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        return status.st_size if stat.S_ISREG(status.st_mode) else None
 
     def expect(self, names: Sequence[str]) -> None:
         """See ``Objects``; the disk is near."""
@@ -222,18 +224,14 @@ class ZipObjects:
         stop = size if stop is None else min(stop, size)
         return self._blob.read(first + start, first + stop) if start < stop else b""
 
-    def exists(self, name: str) -> bool:
-        """See ``Objects``."""
-        return name in self._members
-
     def expect(self, names: Sequence[str]) -> None:
         """See ``Objects``."""
         known = [name for name in names if name in self._members]
         self._blob.expect([(self._members[name][0], self._ends[name]) for name in known])
 
-    def size(self, name: str) -> int:
-        """Bytes of an object that is there."""
-        return self._members[name][1]
+    def size(self, name: str) -> int | None:
+        """See ``Objects``."""
+        return self._members[name][1] if name in self._members else None
 
     def _start(self, name: str) -> int:
         """Where the bytes of an object begin: its own header says how long that is."""
@@ -279,8 +277,6 @@ class _BlobFile(io.RawIOBase):
 
     def read(self, count: int = -1) -> bytes:
         stop = self._blob.size if count < 0 else min(self._at + count, self._blob.size)
-        if stop - self._at > MAX_DIRECTORY:
-            raise OSError(f"its directory has more than {MAX_DIRECTORY} bytes")
         content = self._blob.read(self._at, stop) if self._at < stop else b""
         self._at += len(content)
         return content
@@ -314,13 +310,12 @@ def check_name(name: str, where: object) -> str:
 
 
 def refuse_existing(path: Path, do: str = "choose another path, or delete it") -> None:
-    """Refuse to overwrite anything.
+    """Nothing is overwritten.
 
     Raises:
         StoreExistsError: the path exists.
-        RegistryError: it is an address.
     """
-    if new_path(path).exists():
+    if path.exists():
         raise StoreExistsError(
             "the path to be written exists",
             expected="a new path",
@@ -352,50 +347,28 @@ def write_zip(path: Path, members: Iterable[tuple[str, Path | ZipObjects]]) -> N
         for name, source in members:
             info = zipfile.ZipInfo(name)  # 1980-01-01
             # Zip files write it first: it says whether the sizes need 64 bits.
-            info.file_size = (
-                source.size(name) if isinstance(source, ZipObjects) else source.stat().st_size
-            )
+            info.file_size = _size_of(name, source)
             with archive.open(info, "w") as writer:
                 for piece in _pieces(name, source):
                     writer.write(piece)
 
 
+def _size_of(name: str, source: Path | ZipObjects) -> int:
+    """Bytes of a file or member."""
+    if isinstance(source, ZipObjects):
+        return source.size(name) or 0
+    return source.stat().st_size
+
+
 def _pieces(name: str, source: Path | ZipObjects) -> Iterator[bytes]:
     """The bytes of a file or member, some at a time."""
     if isinstance(source, ZipObjects):
-        for start in range(0, source.size(name), _PIECE_BYTES):
+        for start in range(0, _size_of(name, source), _PIECE_BYTES):
             yield source.read(name, start, start + _PIECE_BYTES) or b""
         return
     with source.open("rb") as reader:
         while piece := reader.read(_PIECE_BYTES):
             yield piece
-
-
-def read_plain(path: Path, limit: int) -> bytes:
-    """Return the bytes of a file that a stranger may have put there.
-
-    Raises:
-        FormatError: it is a link, no plain file, has more bytes than the limit, or cannot be read.
-    """
-    try:
-        # A pipe in the place of a file would be waited for.
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        try:
-            status = os.fstat(handle)
-            if stat.S_ISREG(status.st_mode) and status.st_size <= limit:
-                return _read_range(handle, 0, status.st_size, 0, limit)
-        finally:
-            os.close(handle)
-        got: object = "another kind of file, or a larger one"
-    except OSError as error:
-        got = "a link" if path.is_symlink() else error
-    raise FormatError(
-        "refused to read a file",
-        expected=f"a plain file of at most {limit} bytes, and no link: that could lead anywhere",
-        got=got,
-        where=path,
-        do="if it is yours, put the file itself in its place",
-    )
 
 
 def replace_file(path: Path, content: bytes, *, durable: bool = True) -> None:

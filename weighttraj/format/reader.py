@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -14,8 +15,9 @@ from jaxtyping import Float64, Int64
 
 from weighttraj.errors import DamageError, FormatError, RegistryError, RowError
 from weighttraj.format.catalog import DATASET, parse_dataset, read_dataset_info
+from weighttraj.format.codecs import BLOCK_BYTES
 from weighttraj.format.layout import ParamLayout
-from weighttraj.format.locate import locate
+from weighttraj.format.locate import is_run, locate
 from weighttraj.format.objects import FolderObjects
 from weighttraj.format.schema import (
     RETURNS,
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
     from weighttraj.collect.into import Target
     from weighttraj.load.windows import SnapshotDataset, WindowDataset
     from weighttraj.policies.policy import Policy
+
+
+PIECE_BYTES = 64 << 20
+"""Bytes of an array that are read at a time where all of it is read, about."""
 
 
 @runtime_checkable
@@ -52,6 +58,9 @@ class ArrayStore(Protocol):
 
     def read(self, name: str, key: Any) -> np.ndarray:
         """Read part of an array, within the committed rows; raises DamageError."""
+
+    def chunk_rows(self, name: str) -> int:
+        """Rows of an array that are decoded together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +122,23 @@ class StoredArray:
         if self._spec.name == "policy/weights" and not rest:
             self._check(index, values)
         return values
+
+    def pieces(self, unit: int = 1) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield all rows, some at a time, so that memory stays small: (first row, rows).
+
+        A piece has about 64 MiB, or the rows that are decoded together if these have up to
+        256 MiB; in any case at least one row.
+
+        Args:
+            unit: every piece but the last has a multiple of so many rows.
+        """
+        row = self.dtype.itemsize * max(1, math.prod(self.shape[1:]))
+        together = self._store.chunk_rows(self._spec.name)
+        if unit == 1 and together * row <= BLOCK_BYTES:
+            unit = together
+        step = unit * max(1, PIECE_BYTES // (unit * row))
+        for start in range(0, len(self), step):
+            yield start, self[start : start + step]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self[:], dtype)
@@ -482,7 +508,11 @@ class Dataset:
 def open_dataset(
     path: str | Place, *, runs: Collection[str] | None = None, revision: str | None = None
 ) -> Dataset:
-    """Open a data set: a folder, one HDF5 file (``.h5``), an id, or an address.
+    """Open a data set: a folder, one HDF5 file (``.h5``), one run, an id, or an address.
+
+    The path of a run, a folder ``<id>.zarr`` or a packed run ``<id>.zarr.zip``, opens as a data set
+    of this one run. A folder that holds a data set in ``data``, as ``datasets/<id>`` does, opens as
+    that one.
 
     Ids are looked for in the folders of ``WEIGHTTRAJ_DATASETS_PATH`` (where it names none, in
     ``~/.weighttraj/datasets``), in those of a clone, and in ``data`` of the working directory. A
@@ -498,23 +528,44 @@ def open_dataset(
         revision: branch, tag or commit, of a data set on the hub; it is pinned to its commit.
 
     Raises:
-        FileNotFoundError: there is no data set at the path.
+        FileNotFoundError: there is no data set and no run at the path.
         FormatError: it is none of this format, or a run is a link.
         DamageError: it is complete but lacks a run that it lists.
         RegistryError: it has no run of such an id, or the address is none.
         RemoteError: it is somewhere else, and cannot be reached.
     """
-    if is_remote(path):
+    if isinstance(path, RemotePath) or is_remote(path):
         place = path if isinstance(path, RemotePath) else RemotePath.parse(str(path), revision)
+        if place.name.removesuffix(PACKED).endswith(".zarr"):
+            return _chosen(_alone(open_run(place)), runs)
         return _chosen(_open_remote(place), runs)
     if revision is not None:
-        RemotePath.parse(Path(path).absolute().as_uri(), revision)  # raises: no revisions here
+        RemotePath.parse(f"file://{path}", revision)  # raises: no revisions here
     path = locate(path)
     if path.suffix == ".h5":
         from weighttraj.format.hdf5 import open_hdf5
 
         return _chosen(open_hdf5(path), runs)
+    if not (path / DATASET).is_file() and is_run(path):
+        packed = path.with_name(path.name + PACKED)
+        return _chosen(_alone(open_run(path if path.exists() else packed)), runs)
     return _chosen(_open_folder(path), runs)
+
+
+def _alone(run: Run) -> Dataset:
+    """Return a data set of one run, which lies anywhere."""
+    return Dataset(run.path, info_of_one(run), [run])
+
+
+def info_of_one(run: Run) -> DatasetInfo:
+    """Return the metadata of a data set that has this run only, under the run's id."""
+    info, packed = run.info, run.path.name.endswith(PACKED)
+    path = f"runs/{info.run_id}.zarr{PACKED if packed else ''}"
+    return DatasetInfo(
+        id=info.run_id,
+        runs=(RunEntry(id=info.run_id, path=path, seed=info.seed),),
+        status="complete" if info.status == "complete" else "collecting",
+    )
 
 
 def _open_folder(path: Path) -> Dataset:
@@ -587,7 +638,7 @@ def open_run(path: str | Place) -> Run:
         RemoteError: it is somewhere else, and cannot be reached.
     """
     place: Place
-    if is_remote(path):
+    if isinstance(path, RemotePath) or is_remote(path):
         place = path if isinstance(path, RemotePath) else RemotePath.parse(str(path)).as_object()
     else:
         place = Path(path)

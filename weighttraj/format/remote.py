@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 from weighttraj.errors import DamageError
 from weighttraj.format.objects import ZipObjects, check_name, replaced
 from weighttraj.remote.address import RemotePath
-from weighttraj.remote.store import MAX_OBJECT, Piece, store_at
+from weighttraj.remote.store import NoPartsError, Piece, store_at
 
 TAIL_BYTES = 1 << 16
 """Bytes at the end of a packed run that are fetched first: the directory of 800 objects."""
@@ -29,7 +30,7 @@ def remote_objects(path: RemotePath) -> ZipObjects | RemoteFolder:
     if path.part.endswith(".zip"):
         return ZipObjects(RemoteBlob(path))
     folder = RemoteFolder(path)
-    if not folder.exists("zarr.json"):
+    if folder.size("zarr.json") is None:
         raise FileNotFoundError(f"no run at {path}: it has no zarr.json")
     return folder
 
@@ -65,8 +66,6 @@ class RemoteBlob:
         missing = [span for span in spans if self._find(*span) is None]
         while missing:
             start, stop = missing.pop(0)
-            if stop - start > KEPT_BYTES // 2:
-                return  # asked for when it is read, as far as it is read
             while missing and 0 <= missing[0][0] - stop <= GAP_BYTES:
                 if missing[0][1] - start > KEPT_BYTES // 2:
                     return  # asked for when it is read
@@ -112,16 +111,17 @@ class RemoteFolder:
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """See ``Objects``."""
-        store, limit = store_at(self.path.root), MAX_OBJECT if stop is None else stop
-        if name.endswith("zarr.json"):
-            piece = store.read(self._name(name), limit)
-        else:
-            piece = store.read_large(self._name(name), limit)
+        store, part = store_at(self.path.root), self._name(name)
+        if stop is not None and 0 <= start < stop:
+            with contextlib.suppress(NoPartsError):
+                piece = store.read_range(part, start, stop)
+                return None if piece is None else piece.content
+        piece = store.read(part)
         return None if piece is None else piece.content[start:stop]
 
-    def exists(self, name: str) -> bool:
+    def size(self, name: str) -> int | None:
         """See ``Objects``."""
-        return store_at(self.path.root).size(self._name(name)) is not None
+        return store_at(self.path.root).size(self._name(name))
 
     def expect(self, names: Sequence[str]) -> None:
         """See ``Objects``; each one is asked for when it is read."""

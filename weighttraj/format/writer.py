@@ -27,7 +27,6 @@ from weighttraj.format.schema import (
     with_progress,
 )
 from weighttraj.format.values import as_array
-from weighttraj.remote.address import new_path
 
 Moments = tuple[np.ndarray, np.ndarray, float]
 """Statistics of a normaliser: mean, variance, count."""
@@ -36,7 +35,8 @@ Moments = tuple[np.ndarray, np.ndarray, float]
 class RunWriter:
     """Writes the snapshots of one training run, from any trainer.
 
-    Snapshots are committed in blocks of ``info.block``. Readers see committed snapshots only, so
+    Snapshots are committed in blocks of ``info.block``, or of as many as fit into 256 MiB if the
+    snapshots are large. Readers see committed snapshots only, so
     a process that is killed loses at most the block it was filling. Used as a context manager, it
     marks the run ``complete``, or ``crashed`` when an exception passes; both commit what is left.
 
@@ -57,7 +57,7 @@ class RunWriter:
     """
 
     def __init__(self, path: str | Path, info: RunInfo, *, resume: bool = False) -> None:
-        path = new_path(path)
+        path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lock = lock_run(path)
         try:
@@ -147,7 +147,7 @@ class RunWriter:
             **({} if critic is None else {"critic/weights": critic}),
             **_named("moments", _ADAM, moments),
         }
-        digest = hashlib.sha256(np.ascontiguousarray(flat, "<f4").tobytes()).digest()
+        digest = hashlib.sha256(np.ascontiguousarray(flat, "<f4").data).digest()
         values["digest"] = np.frombuffer(digest, np.uint8)
         self._append("time", values)
 
@@ -319,6 +319,7 @@ _MAY_DIFFER = (
     "n_committed_iterations",
     "provenance",
     "profile",
+    "block",  # moves no value, and large snapshots have a smaller one
     "evaluation",  # snapshots that are appended have no returns yet
 )
 

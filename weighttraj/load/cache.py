@@ -28,9 +28,6 @@ from weighttraj.format.objects import sync
 VARIABLE = "WEIGHTTRAJ_CACHE"
 """Environment variable that names the cache's folder."""
 
-PIECE_BYTES = 64 << 20
-"""Decoded bytes that are in memory while an entry is made, about."""
-
 _ENTRY = re.compile(r"([0-9a-f])[0-9a-f]{63}\.npy")
 _DRAFT = re.compile(r"\.([0-9a-f])[0-9a-f]{63}\.[0-9a-f]{16}\.draft")
 _DIGITS = "0123456789abcdef"
@@ -113,14 +110,8 @@ class CachedWeights:
     def _pieces(self) -> Iterator[memoryview]:
         """The bytes of the entry; rows are read from the run, and so checked, piece by piece."""
         yield memoryview(_header(self.shape))
-        n, width = self.shape
-        block = self.run.info.block
-        # A power of two of blocks: wide packed runs have 64 or 128 rows in a chunk.
-        blocks = max(1, PIECE_BYTES // (4 * max(1, width) * block))
-        step = block << (blocks.bit_length() - 1)
-        for start in range(0, n, step):
-            rows = np.ascontiguousarray(self.run.weights[start : start + step], "<f4")
-            yield rows.reshape(-1).view(np.uint8).data
+        for _, rows in self.run.weights.pieces():
+            yield np.ascontiguousarray(rows, "<f4").reshape(-1).view(np.uint8).data
 
     def __repr__(self) -> str:
         return f"<CachedWeights of {self.run.id}: time {self.shape[0]}, param {self.shape[1]}>"

@@ -41,16 +41,18 @@ def create(
     *,
     splits: Mapping[str, str] | None = None,
     name: str | None = None,
+    version: str = "1",
     licence: str = "CC-BY-4.0",
     console: Console | None = None,
 ) -> Dataset:
-    """A data set of finished runs, wherever they come from.
+    """Make a data set of finished runs, wherever they come from.
 
     Args:
         runs: paths of runs, folders or packed ones, each of its own id.
         out: folder of the new data set.
         splits: ``train``, ``validation`` or ``test`` for ids of runs; others are in no part.
         name: its id; None: the folder's name.
+        version: version of the data.
         licence: of the data, as an SPDX identifier.
         console: where progress is shown; None: nowhere.
 
@@ -59,6 +61,13 @@ def create(
         RegistryError: a run is not complete, two have one id, or a split is of no run or none.
         StoreExistsError: the folder exists.
     """
+    if isinstance(runs, str | Path) or not isinstance(out, str | Path):
+        raise RegistryError(
+            "the arguments are in the wrong order, or the runs are not in a list",
+            expected='create(["a.zarr", "b.zarr"], "out"): a list of paths of runs, then a folder',
+            got=f"create({runs!r}, {out!r})",
+            do="give the runs first, in a list",
+        )
     opened, wanted = [open_run(path) for path in runs], dict(splits or {})
     ids = Counter(run.id for run in opened)
     unfinished = [run.id for run in opened if run.info.status != "complete"]
@@ -77,7 +86,7 @@ def create(
             do="correct splits",
         )
     chosen = {run.id: (run, wanted.get(run.id, "")) for run in opened}
-    info = DatasetInfo(id=name or Path(out).name, licence=licence)
+    info = DatasetInfo(id=name or Path(out).name, version=version, licence=licence)
     return _write(Path(out), info, chosen, console)
 
 
@@ -212,11 +221,12 @@ def split(
 
 def _complete(path: str | Path) -> Dataset:
     dataset = open_dataset(path)
-    if dataset.info.status != "complete" or Path(dataset.path).is_file():
+    hdf5 = Path(dataset.path).suffix == ".h5"
+    if dataset.info.status != "complete" or hdf5:
         raise RegistryError(
             "only a complete data set in a folder can be made into another one",
             expected="status complete",
-            got="an HDF5 file" if Path(dataset.path).is_file() else dataset.info.status,
+            got="an HDF5 file" if hdf5 else dataset.info.status,
             where=dataset.path,
             do="finish collecting it, or import the file first",
         )

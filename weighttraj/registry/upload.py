@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -14,13 +13,12 @@ from rich.progress import BarColumn, DownloadColumn, TextColumn, TransferSpeedCo
 from weighttraj.errors import RegistryError
 from weighttraj.format import Dataset, lint, open_dataset, verify
 from weighttraj.format.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
-from weighttraj.format.locate import locate
-from weighttraj.format.objects import read_plain
+from weighttraj.format.locate import is_run, locate
 from weighttraj.progress import LoggedProgress
 from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.hub import client, hub_error, pinned
-from weighttraj.remote.store import MAX_DOCUMENT, RemoteStore, store_at
+from weighttraj.remote.store import RemoteStore, store_at
 
 CLAIM = "UPLOADING.sha256"
 """Object that holds the manifest of what is being uploaded, for as long as it is."""
@@ -61,7 +59,15 @@ def upload(
         RemoteError: the address cannot be reached.
     """
     place = RemotePath.parse(address)
-    dataset = open_dataset(locate(path))
+    if is_run(here := locate(path)) and here.suffix != ".h5":
+        raise RegistryError(
+            "a run is published as a data set of one run, with a card",
+            expected="a data set",
+            got="one run",
+            where=here,
+            do=f"weighttraj create OUT {here}, then weighttraj card OUT, then upload OUT",
+        )
+    dataset = open_dataset(here)
     folder = Path(dataset.path)
     _check(dataset, folder, despite_lint)
     console = console or Console(quiet=True)
@@ -96,8 +102,7 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             where=folder,
             do=f"weighttraj card {folder}",
         )
-    text = read_plain(folder / CARD, MAX_DOCUMENT).decode(errors="replace")
-    if re.search(r"^## Citation\s*$", text, re.MULTILINE) is None:
+    if "\n## Citation\n" not in (folder / CARD).read_text():
         raise RegistryError(
             "the card does not say how the data set is to be cited",
             expected=f"a section '## Citation' in {CARD}",
@@ -105,7 +110,6 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             where=folder,
             do="write one, or let `weighttraj card` make the card",
         )
-    _check_documents(folder)
     if problems := verify(folder):
         raise RegistryError(
             "the data set is damaged",
@@ -119,20 +123,6 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             got="\n    ".join(findings[:5]),
             where=folder,
             do="correct it; if it is meant so, say so in the card and give --despite-lint",
-        )
-
-
-def _check_documents(folder: Path) -> None:
-    """Refuse what no reader would take: what is published can be read."""
-    files = [folder / name for name in (DATASET, MANIFEST)]
-    sizes = {file.name: file.stat().st_size for file in files if file.is_file()}
-    if too_large := {name: size for name, size in sizes.items() if size > MAX_DOCUMENT}:
-        raise RegistryError(
-            "a list of the data set is larger than readers take from an address",
-            expected=f"at most {MAX_DOCUMENT} bytes",
-            got=", ".join(f"{name}: {size}" for name, size in too_large.items()),
-            where=folder,
-            do="pack its runs (weighttraj pack), or publish it as several data sets",
         )
 
 
@@ -154,7 +144,7 @@ def upload_folder(
         RemoteError: the address cannot be reached.
     """
     if place.scheme == "file":
-        _make_folder(Path(place.root.path))
+        Path(place.root.removeprefix("file://")).mkdir(parents=True, exist_ok=True)
     store, manifest = store_at(place.root), (folder / MANIFEST).read_bytes()
     claimed = store.write(CLAIM, manifest, new=True)
     if not claimed and (there := store.read(CLAIM)) is not None and there.content != manifest:
@@ -204,7 +194,7 @@ def _send_all(
 
 
 def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: bool) -> RemotePath:
-    hub, repo = client(), repository_of(place)
+    hub, repo = client(), place.repository.removeprefix("hf://")
     api, kind, tag = hub.HfApi(), "dataset", f"v{dataset.info.version}"
 
     def asked(do: Callable[[], Any]) -> Any:
@@ -214,12 +204,12 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
             raise hub_error(error, str(place)) from error
 
     asked(lambda: api.create_repo(repo, repo_type=kind, private=private, exist_ok=True))
-    before = pinned(place)
+    before = pinned(RemotePath.parse(place.repository))
     there = store_at(before.root).read(MANIFEST)
     tags = [t.name for t in asked(lambda: api.list_repo_refs(repo, repo_type=kind)).tags]
     if there is None or there.content != (folder / MANIFEST).read_bytes():
         if tag in tags:
-            raise _immutable(place.at(tag))
+            raise _immutable(RemotePath.parse(place.repository, tag))
         # One commit: the client's upload_folder makes several of many files, and readers see them.
         lines = [line.path for line in read_manifest(folder)]
         names = {*lines, MANIFEST}
@@ -235,38 +225,10 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
                 parent_commit=before.commit,  # refused if another publisher was quicker
             )
         )
-    now = pinned(place)
+    now = pinned(RemotePath.parse(place.repository))
     if tag not in tags:
         asked(lambda: api.create_tag(repo, tag=tag, revision=now.commit, repo_type=kind))
     return now
-
-
-def repository_of(place: RemotePath) -> str:
-    """Return the repository of the hub that something is published in, ``organisation/name``.
-
-    Raises:
-        RegistryError: the address names a revision, or a folder in the repository.
-    """
-    if place.part or place.root.revision != "main":
-        raise RegistryError(
-            "on the hub one repository holds one data set or model, and main its latest version",
-            expected=f"hf://{place.root.host}",
-            got=place,
-            do="leave the rest of the address out; versions become tags",
-        )
-    return place.root.host
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RegistryError(
-            "the folder of this address cannot be made",
-            got=error,
-            where=path,
-            do="correct the address or the permissions",
-        ) from error
 
 
 def _immutable(place: RemotePath) -> RegistryError:
@@ -279,4 +241,4 @@ def _immutable(place: RemotePath) -> RegistryError:
     )
 
 
-__all__ = ["CLAIM", "repository_of", "upload", "upload_folder"]
+__all__ = ["CLAIM", "upload", "upload_folder"]
