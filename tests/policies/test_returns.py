@@ -368,3 +368,23 @@ def test_sampled_returns_that_tell_nothing_apart_are_found(
     assert (sampled == sampled[0]).all() == bool(found)
     assert [finding.check for finding in lint_returns(run)] == found
     assert ("returns" in {finding.check for finding in wt.lint(tmp_path / "data")}) == bool(found)
+
+
+def test_one_run_gets_returns_as_a_data_set_does(dataset: Path, tmp_path: Path) -> None:
+    alone = Path(shutil.copy(dataset / "runs/seed0000.zarr.zip", tmp_path / "mine.zarr.zip"))
+    filled = fill_returns(alone, CONFIG)
+    assert [run.path for run in filled] == [alone]
+    assert sorted(p.name for p in tmp_path.iterdir() if not p.name.endswith(".lock")) == [
+        "mine.zarr.zip",
+        "small",
+    ]
+    inside = fill_returns(dataset / "runs/seed0000.zarr.zip", CONFIG)
+    assert stored(alone) == stored(inside.path)  # type: ignore[arg-type]
+    assert [r.evaluation is not None for r in wt.open(dataset)] == [True, False, False, False]
+    assert wt.verify(dataset) == []
+
+
+def test_an_hdf5_file_gets_no_returns(dataset: Path, tmp_path: Path) -> None:
+    file = wt.export_hdf5(dataset, tmp_path / "small.h5")
+    with pytest.raises(PolicyError, match=r"(?s)not stored in an HDF5 file.*weighttraj import"):
+        fill_returns(file, CONFIG)

@@ -26,7 +26,6 @@ from weighttraj.format.integrity import seal
 from weighttraj.format.storage import PACKED, read_info
 from weighttraj.plugins import import_modules
 from weighttraj.progress import LoggedProgress
-from weighttraj.remote.address import new_path
 
 
 def collect(
@@ -73,7 +72,7 @@ def collect(
         )
     if recipe.collect.collector == "population":
         check_config(recipe.ppo)
-    out = new_path(out).absolute()
+    out = Path(out).absolute()
     console = console or Console(quiet=True)
     # The engine is closed first: then the seconds of its processes are known.
     with (

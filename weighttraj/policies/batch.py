@@ -17,6 +17,7 @@ from weighttraj.format.schema import ObsNorm
 from weighttraj.policies.policy import (
     ACTIVATIONS,
     LOG_STD_RANGE,
+    check_acts,
     deviation_layer,
     network,
     normalize,
@@ -155,11 +156,13 @@ def load_policies(
             for measuring what that changes.
 
     Raises:
-        PolicyError: the run's policy cannot be rebuilt; the message says why.
+        PolicyError: the run's policy cannot be rebuilt, or its weights are not finite; the message
+            says why.
         IndexError: there is no such snapshot.
     """
     chosen: Any = rows if isinstance(rows, slice) else np.asarray(rows)
     weights = run.weights[chosen]
+    check_acts(weights, np.arange(len(run))[chosen], run.path)
     mean = var = None
     if run.info.obs_norm is not None:
         source = np.full(len(weights), len(run) - 1) if final_normalizer else chosen

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -163,14 +163,35 @@ class Policy:
         return f"<Policy {self.spec.mode}, {self.spec.activation}, units {units}>"
 
 
+def check_acts(weights: np.ndarray, rows: Sequence[int] | np.ndarray, where: object) -> None:
+    """Raise PolicyError if a snapshot has weights that are not finite: it would act at random.
+
+    Args:
+        weights: float32 (snapshot, param).
+        rows: number of each snapshot.
+        where: the run, for the message.
+    """
+    for row, values in zip(rows, weights, strict=True):
+        if not np.isfinite(values).all():
+            raise PolicyError(
+                "a snapshot has weights that are NaN or infinite, so its policy does not act",
+                expected="finite weights",
+                got=f"{int((~np.isfinite(values)).sum())} of {values.size} not finite",
+                where=f"{where}, snapshot {row}",
+                do="choose another snapshot; weighttraj lint names all that are broken",
+            )
+
+
 def load_policy(run: Run, t: int = -1) -> Policy:
     """The policy of snapshot t of a run, with the normaliser that it acted with at t.
 
     Raises:
-        PolicyError: the run's policy cannot be rebuilt; the message says why.
+        PolicyError: the run's policy cannot be rebuilt, or its weights are not finite; the message
+            says why.
         IndexError: there is no such snapshot.
     """
     weights: Any = run.weights[t]
+    check_acts(weights[None], [t], run.path)
     return Policy(run.info.policy, run.layout, weights, run.info.obs_norm, run.obs_norm(t))
 
 

@@ -33,7 +33,7 @@ from rich.progress import (
 from weighttraj.engine import Engine, Tell, engine_of
 from weighttraj.errors import PolicyError, StoreLockedError
 from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, store_returns
-from weighttraj.format.catalog import MANIFEST, read_dataset_info
+from weighttraj.format.catalog import DATASET, MANIFEST, read_dataset_info
 from weighttraj.format.integrity import seal, unseal
 from weighttraj.format.objects import replace_file
 from weighttraj.format.storage import PACKED
@@ -123,13 +123,14 @@ def fill_returns(
     replace: bool = False,
     console: Console | None = None,
 ) -> Dataset:
-    """Evaluate stored policies and store their returns in the runs of a data set.
+    """Evaluate stored policies and store their returns in the runs of a data set, or in one run.
 
     What is stored already, or was played before an interruption, is not played again. Runs that are
     still being collected are left for later. The result does not depend on the number of workers.
 
     Args:
-        path: data set.
+        path: data set or run. Of a run in a data set, that run only is evaluated, and the tables
+            and the manifest of the data set are written again.
         config: which snapshots and episodes; None: the defaults.
         workers: processes; 1 means this one.
         scheduler: address of a Dask scheduler whose workers do it instead, or ``local``; see
@@ -150,18 +151,46 @@ def fill_returns(
     """
     path, config = here(path).absolute(), config or ReturnsConfig()
     console = console or Console(quiet=True)
-    read_dataset_info(path)  # before a lock is put beside it: is there one?
-    with engine_of(workers, scheduler, imports) as engine, _only_one(path.resolve()):
+    dataset = open_dataset(path)  # before a lock is put beside it: is there one?
+    path = Path(dataset.path)
+    if path.suffix == ".h5":
+        raise PolicyError(
+            "returns are not stored in an HDF5 file",
+            expected="a data set in a folder, or a run",
+            got="an HDF5 file",
+            where=path,
+            do=f"weighttraj import {path} --out FOLDER, and evaluate the runs there",
+        )
+    owner = _owner(path)
+    home = owner or path.parent
+    with engine_of(workers, scheduler, imports) as engine, _only_one((owner or path).resolve()):
         runs = _finished(open_dataset(path), console)
-        works = [_Work(run, path / ".returns", config, replace=replace) for run in runs]
-        works = [work for work in works if work.missing or work.unsaved]
-        if works:
-            unseal(path)
+        works = [_Work(run, home / ".returns", config, replace=replace) for run in runs]
+        todo = [work for work in works if work.missing or work.unsaved]
+        _say_broken(works, console)
+        works = todo
+        if works and owner:
+            unseal(owner)
         _play(works, engine, console)
         # Also when a run got its returns before a kill, and the tables did not.
-        if open_dataset(path).info.status == "complete" and not (path / MANIFEST).is_file():
-            seal(path)
+        if owner and _is_unsealed(owner):
+            seal(owner)
     return open_dataset(path)
+
+
+def _owner(path: Path) -> Path | None:
+    """Return the data set at a path, or the one that a run at the path is listed in; None: none."""
+    if (path / DATASET).is_file():
+        return path
+    above = path.parent.parent
+    if path.parent.name == "runs" and (above / DATASET).is_file():
+        listed = {above / entry.path for entry in read_dataset_info(above).runs}
+        return above if path in listed else None
+    return None
+
+
+def _is_unsealed(path: Path) -> bool:
+    return read_dataset_info(path).status == "complete" and not (path / MANIFEST).is_file()
 
 
 _SAME = ("seeds", "deterministic", "normalizer", "simulator")
@@ -186,6 +215,7 @@ class _Work:
         with Evaluator(env_of(run), episodes=1) as evaluator:
             self.evaluation = config.evaluation(evaluator.simulator)
         self._journal = _Journal(folder / f"{run.id}.jsonl", self._header())
+        self._finite: dict[int, bool] = {}
         self.played = self._stored(replace=replace) | self._journal.rows
         self.unsaved = len(self._journal.rows)
         packed = Path(run.path).suffix == PACKED
@@ -201,12 +231,26 @@ class _Work:
     @property
     def missing(self) -> list[int]:
         """Snapshots that are still to be played, as far as they are known."""
-        missing = [row for row in self.config.rows(len(self.run)) if row not in self.played]
+        missing = self._to_play(self.config.rows(len(self.run)))
         if missing or not self.config.learning:
             return missing
         # Only now the returns tell how far the learning phase goes.
-        dense = range(0, self._learned() + 1, self.config.learning)
-        return [row for row in dense if row not in self.played]
+        return self._to_play(range(0, self._learned() + 1, self.config.learning))
+
+    def _to_play(self, rows: Sequence[int]) -> list[int]:
+        """Return the snapshots that were not played and can be: their weights are finite."""
+        rows = [row for row in rows if row not in self.played]
+        unknown = [row for row in rows if row not in self._finite]
+        for start in range(0, len(unknown), BLOCK):
+            block = unknown[start : start + BLOCK]
+            finite = [bool(np.isfinite(row).all()) for row in self.run.weights[block]]
+            self._finite |= dict(zip(block, finite, strict=True))
+        return [row for row in rows if self._finite[row]]
+
+    @property
+    def broken(self) -> list[int]:
+        """Snapshots whose weights are not finite, as far as they were asked for."""
+        return sorted(row for row, finite in self._finite.items() if not finite)
 
     def begin(self) -> None:
         """Begin the journal; store what an earlier one holds, if that is all."""
@@ -247,7 +291,8 @@ class _Work:
         columns = ~deterministic if not deterministic.all() else deterministic
         means = np.full(len(self.run), np.nan)
         for row in self.config.rows(len(self.run)):
-            means[row] = self.played[row][0][columns].mean()
+            if row in self.played:  # else its weights are not finite
+                means[row] = self.played[row][0][columns].mean()
         return learning_phase(means)
 
     def _stored(self, *, replace: bool) -> _Played:
@@ -358,6 +403,15 @@ def _finished(dataset: Dataset, console: Console) -> list[Run]:
     for why, ids in left.items():
         console.print(f"{why}, so left for later: {', '.join(ids)}")
     return done
+
+
+def _say_broken(works: Sequence[_Work], console: Console) -> None:
+    for work in works:
+        if broken := work.broken:
+            console.print(
+                f"{work.run.id}: {len(broken)} snapshots have weights that are NaN or infinite, "
+                f"the first at t = {broken[0]}, so they are not evaluated"
+            )
 
 
 def _play(works: Sequence[_Work], engine: Engine, console: Console) -> None:

@@ -130,7 +130,11 @@ def _page(source: Source, *, film: bool, seed: int, progress: Progress) -> str:
     walks = [walk(run, lambda rows: progress.advance(reading, rows)) for run in runs]
     movie, why_not = None, _LEFT_OUT if not film else "There is no snapshot yet."
     if playing is not None and runs:
-        movie, why_not = _film(_typical(runs), seed, progress, playing)
+        typical = _typical(runs)
+        if walks[typical].broken.size:
+            why_not = f"Run {runs[typical].id} has weights that are NaN or infinite."
+        else:
+            movie, why_not = _film(runs[typical], seed, progress, playing)
     loader = jinja2.PackageLoader("weighttraj.publish", "templates")
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -145,8 +149,18 @@ def _page(source: Source, *, film: bool, seed: int, progress: Progress) -> str:
         settings=settings(source),
         film=movie,
         why_not=why_not,
+        broken=[_broken(run, w) for run, w in zip(runs, walks, strict=True) if w.broken.size],
         **_returns(runs),
         **_weights(runs, walks),
+    )
+
+
+def _broken(run: Run, walk: Walk) -> str:
+    """Say which snapshots of a run cannot be shown."""
+    return (
+        f"Run {run.id}: {walk.broken.size:,} of {len(run):,} snapshots have weights that are NaN "
+        f"or infinite, the first at t = {walk.broken[0]:,}. They are left out of the figures of "
+        "steps, spectrum and path."
     )
 
 
@@ -251,10 +265,10 @@ def _quartiles(values: Sequence[float]) -> str:
     return f"{number(float(middle))} ({number(float(low))} to {number(float(high))})"
 
 
-def _typical(runs: Sequence[Run]) -> Run:
-    """The run whose final return is the median."""
+def _typical(runs: Sequence[Run]) -> int:
+    """Return the index of the run whose final return is the median."""
     order = np.argsort([np.nan_to_num(final_return(run)[0]) for run in runs], kind="stable")
-    return runs[int(order[(len(runs) - 1) // 2])]
+    return int(order[(len(runs) - 1) // 2])
 
 
 def _film(run: Run, seed: int, progress: Progress, task: Any) -> tuple[dict[str, Any] | None, str]:

@@ -7,14 +7,14 @@ whatever the size of the policy. A Gram matrix squares the condition number: sin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from weighttraj.format import Run
-from weighttraj.format.export import PIECE_BYTES, pieces
 from weighttraj.publish.curves import thin
 
 MAX_ROWS = 400
@@ -29,7 +29,6 @@ FLOOR = 1e-8
 SHARE_FLOOR = 1e-13
 """Shares of the squared norm below this are rounding errors."""
 
-_ROWS = 128  # of a read: whole chunks of large policies
 _COLUMNS = 8192  # of a product in float64
 
 
@@ -49,6 +48,9 @@ class Walk:
     """Displacements phi_t - phi_0 in their first two principal directions."""
     path_share: Float64[np.ndarray, " 2"]
     """Share of the squared displacements in each direction."""
+    broken: Int64[np.ndarray, " broken"] = field(default_factory=lambda: np.empty(0, np.int64))
+    """Snapshots with NaN or infinite weights: left out above, where the steps to and from them are
+    NaN."""
 
     @property
     def moved(self) -> bool:
@@ -69,25 +71,31 @@ def walk(run: Run, advance: Callable[[int], None] = lambda rows: None) -> Walk:
     row = 4 * run.layout.size
     chosen = thin(len(run), max(2, min(MAX_ROWS, MAX_BYTES // row)))
     kept: Float32[np.ndarray, "row param"] = np.empty((len(chosen), run.layout.size), np.float32)
-    steps, last = [], None
-    for start, block in pieces(run.weights, max(1, min(_ROWS, PIECE_BYTES // row))):
+    steps: list[float] = []
+    broken: list[int] = []
+    last: Float32[np.ndarray, " param"] | None = None
+    for start, block in run.weights.pieces():
         mine = (chosen >= start) & (chosen < start + len(block))
         kept[mine] = block[chosen[mine] - start]
-        if last is not None:
-            steps.append(_norms(block[:1] - last))
-        steps.append(_norms(np.diff(block, axis=0)))
-        last = block[-1:].copy()
+        for t, row in enumerate(block, start):
+            broken += [] if np.isfinite(row).all() else [t]
+            steps += [] if last is None else [_distance(row, last)]
+            last = row
+        last = block[-1].copy()  # the block need not stay in memory
         advance(len(block))
+    whole = ~np.isin(chosen, broken)
+    chosen, kept = chosen[whole], kept[whole]
     gram = _gram(kept)
     singular, beyond = spectrum(gram)
     path, share = _path(gram)
     return Walk(
-        steps=np.concatenate(steps),
+        steps=np.array(steps, np.float64),
         rows=chosen,
         singular=singular,
         beyond=beyond,
         path=path,
         path_share=share,
+        broken=np.array(broken, np.int64),
     )
 
 
@@ -95,6 +103,8 @@ def spectrum(
     gram: Float64[np.ndarray, "row row"],
 ) -> tuple[Float64[np.ndarray, " rank"], Float64[np.ndarray, " rank"]]:
     """Singular values above the floor, and the share of the squared norm beyond each rank."""
+    if not len(gram):
+        return np.empty(0), np.empty(0)
     squares = np.maximum(np.linalg.eigvalsh(gram)[::-1], 0)
     keep = squares > FLOOR**2 * squares[0]
     beyond = np.append(np.cumsum(squares[::-1])[::-1][1:], 0) / (squares.sum() or 1)
@@ -107,9 +117,15 @@ def rank_for(walk: Walk, share: float) -> int | None:
     return int(enough[0]) + 1 if len(enough) else None
 
 
-def _norms(rows: Float32[np.ndarray, "row param"]) -> Float64[np.ndarray, " row"]:
-    norms: np.ndarray = np.sqrt(np.einsum("ij,ij->i", rows, rows, dtype=np.float64))
-    return norms
+def _distance(one: Float32[np.ndarray, " param"], other: Float32[np.ndarray, " param"]) -> float:
+    """Return the L2 distance of two snapshots; NaN if one of them is not finite."""
+    total = 0.0
+    for start in range(0, len(one), _COLUMNS):
+        part = slice(start, start + _COLUMNS)
+        with np.errstate(invalid="ignore"):
+            difference = one[part].astype(np.float64) - other[part]
+        total += float(difference @ difference)
+    return math.sqrt(total) if math.isfinite(total) else math.nan
 
 
 def _gram(rows: Float32[np.ndarray, "row param"]) -> Float64[np.ndarray, "row row"]:
@@ -124,6 +140,8 @@ def _path(
     gram: Float64[np.ndarray, "row row"],
 ) -> tuple[Float64[np.ndarray, "row 2"], Float64[np.ndarray, " 2"]]:
     """Coordinates of phi_t - phi_0; each direction points to where the path goes."""
+    if not len(gram):
+        return np.zeros((0, 2)), np.zeros(2)
     moved = gram - gram[:1] - gram[:, :1] + gram[0, 0]
     values, vectors = np.linalg.eigh((moved + moved.T) / 2)
     values = np.maximum(values[::-1], 0)

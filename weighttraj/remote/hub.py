@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from typing import Any
-from urllib.parse import quote
 
 from weighttraj.errors import RemoteError, missing_extra
-from weighttraj.remote.address import RemotePath, Root
-from weighttraj.remote.wait import within
+from weighttraj.remote.address import RemotePath
 
 
 def client() -> Any:
-    """Return the module ``huggingface_hub``.
+    """``huggingface_hub``.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -26,58 +24,54 @@ def client() -> Any:
 
 
 def pinned(place: RemotePath) -> RemotePath:
-    """Return the place at the commit that its revision is now, so that later commits do not matter.
+    """The same, at the commit that its revision is now: later commits change nothing for a reader.
 
     Raises:
-        RemoteError: there is no such repository or revision, or the hub cannot be reached in time.
+        RemoteError: there is no such repository or revision, or the hub cannot be reached.
     """
     if place.commit is not None:
         return place
-    hub, root = client(), place.root
-
-    def ask() -> Any:
-        return hub.HfApi().repo_info(root.host, revision=root.revision, repo_type="dataset").sha
-
+    repo, revision = _parts(place.root)
+    hub = client()
     try:
-        return place.at(within(ask, place))
-    except RemoteError:
-        raise
+        commit = hub.HfApi().repo_info(repo, revision=revision, repo_type="dataset").sha
     except Exception as error:
-        raise hub_error(error, place) from error
+        raise hub_error(error, place.root) from error
+    return RemotePath(f"hf://{repo}@{commit}", place.part)
 
 
-def resolve_url(root: Root) -> str:
-    """Return the URL below which the files of a repository are."""
-    revision = quote(root.revision, safe="")
-    return f"{client().constants.ENDPOINT}/datasets/{root.host}/resolve/{revision}"
+def resolve_url(root: str) -> str:
+    """Where the files of a repository are, over HTTP."""
+    repo, revision = _parts(root)
+    return f"{client().constants.ENDPOINT}/datasets/{repo}/resolve/{revision}"
 
 
 def headers() -> dict[str, str]:
-    """Return the header that holds the user's token, if there is one."""
+    """Who we are, if we have said so."""
     token = client().get_token()
     return {"authorization": f"Bearer {token}"} if token else {}
 
 
-def hub_error(error: Exception, where: object) -> RemoteError:
-    """Return an error of the hub's client as one of this package."""
+def hub_error(error: Exception, where: str) -> RemoteError:
+    """An error of the hub's client as ours, with its cause."""
     hub = client()
-    status = getattr(getattr(error, "response", None), "status_code", None)
-    what, do = "the hub does not do what was asked", "see what it answers, and try again"
+    do = "see whether the hub can be reached, and try again"
     if isinstance(error, hub.errors.OfflineModeIsEnabled):
         do = "unset HF_HUB_OFFLINE, or name a data set that was downloaded before"
     elif isinstance(error, hub.errors.RepositoryNotFoundError | hub.errors.RevisionNotFoundError):
         do = "correct the name; if it is private: hf auth login, or set HF_TOKEN"
-    elif status in (401, 403):
-        do = "hf auth login, or set HF_TOKEN to a token that may do this; ask for access if the "
-        do += "repository is gated"
-    elif status is None and not isinstance(error, ValueError):
-        what, do = "the hub cannot be reached", "check the network, HF_ENDPOINT and the proxy"
     return RemoteError(
-        what,
+        "the hub does not do what was asked",
         got=f"{type(error).__name__}: {' '.join(str(error).split())[:400]}",
         where=where,
         do=do,
     )
+
+
+def _parts(root: str) -> tuple[str, str]:
+    """Repository and revision of a root."""
+    repo, _, revision = root.removeprefix("hf://").partition("@")
+    return repo, revision
 
 
 __all__ = ["client", "headers", "hub_error", "pinned", "resolve_url"]
