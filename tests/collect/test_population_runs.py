@@ -181,6 +181,19 @@ def described(recipe: Recipe) -> Any:
     return DatasetInfo(id=recipe.id, version=recipe.version, recipe=document)
 
 
+def test_replaying_refuses_a_recipe_of_which_there_can_be_no_runs(
+    quick: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "dataset"
+    shutil.copytree(quick, out)
+    info = read_dataset_info(out)
+    for change in ({"n_steps": 0}, {"net_arch": [0]}, {"env_id": "NoSuchEnv-v0"}):
+        ppo = {**info.recipe["ppo"], **change}
+        write_dataset_info(out, replace(info, recipe={**info.recipe, "ppo": ppo}))
+        with pytest.raises(RecipeError, match=rf"(?s)ppo\.{next(iter(change))} = .*where: {out}"):
+            replay(out, 3)
+
+
 def test_replaying_finds_an_honest_population_and_another(quick: Path) -> None:
     assert replay(quick, 6, seed=1) == []
     info = read_dataset_info(quick)
@@ -230,12 +243,12 @@ class Scaled(gym.Wrapper[Any, Any, Any, Any]):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"env_id": "CartPole-v1"}, "batched physics"),
-        ({"env_id": "Pendulum-v1"}, "batched physics"),
-        ({"env_id": "Humanoid-v5"}, "batched physics"),
-        ({"env_id": "WrappedPendulum-v0"}, "batched physics"),
-        ({"batch_size": 24, "n_steps": 72}, "'batch_size': 24"),
-        ({"batch_size": 48}, "'n_steps': 64"),
+        ({"env_id": "CartPole-v1"}, "env_id = CartPole-v1"),
+        ({"env_id": "Pendulum-v1"}, "env_id = Pendulum-v1"),
+        ({"env_id": "Humanoid-v5"}, "env_id = Humanoid-v5"),
+        ({"env_id": "WrappedPendulum-v0"}, "env_id = WrappedPendulum-v0"),
+        ({"batch_size": 24, "n_steps": 72}, "batch_size = 24"),
+        ({"batch_size": 48}, "n_steps = 64"),
     ],
 )
 def test_what_it_cannot_do_names_the_other_collector(
@@ -249,6 +262,6 @@ def test_what_it_cannot_do_names_the_other_collector(
             additional_wrappers=(wrapper,),
         )
     recipe = replace(QUICK, ppo=replace(QUICK.ppo, **change))
-    with pytest.raises(CollectError, match=rf'(?s){reason}.*collector = "sb3"'):
+    with pytest.raises(RecipeError, match=rf'(?s)collector = "sb3".*{reason}'):
         collect(recipe, tmp_path / "dataset")
     assert not (tmp_path / "dataset").exists()

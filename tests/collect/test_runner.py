@@ -83,7 +83,7 @@ def test_our_recipes_can_be_read() -> None:
         (("= 768", "= 63"), r"(?s)at least one rollout, n_steps = 64.*total_timesteps = 63"),
         (("block = 8", "block = 0"), "store.block at least 1"),
         (("batch_size = 16", "batch_size = 65"), r"(?s)batch_size from 2 to n_steps.*= 65"),
-        (("n_epochs = 2", "n_epochs = 0\ngamma = 2.0"), r"(?s)n_epochs at.*gamma from 0 to 1"),
+        (("n_epochs = 2", "n_epochs = 0\ngamma = 2.0"), r"(?s)n_epochs from 1.*gamma from 0 to 1"),
     ],
 )
 def test_a_bad_recipe_is_one_clear_error(
@@ -92,6 +92,130 @@ def test_a_bad_recipe_is_one_clear_error(
     recipe_file.write_text(TOML.replace(*change))
     with pytest.raises(RecipeError, match=message):
         read_recipe(recipe_file)
+
+
+# Each stands in line 4, of which the error must tell.
+IMPOSSIBLE = [
+    "learning_rate = inf",
+    "learning_rate = nan",
+    "learning_rate = 0.0",
+    "learning_rate = 1e400",
+    "ent_coef = inf",
+    "vf_coef = nan",
+    "gamma = 1.01",
+    "gae_lambda = -0.1",
+    "clip_range = 0.0",
+    "clip_range_vf = 0.0",
+    "max_grad_norm = 0",
+    "adam_eps = 0.0",
+    "log_std_init = -inf",
+    "net_arch = []",
+    "net_arch = [8, 0]",
+    "net_arch = [1_000_000_000_000]",
+    "net_arch = [60_000, 60_000]",
+    "critic_arch = [-1]",
+    "n_steps = 0",
+    "n_epochs = 0",
+    "batch_size = 0",
+    "total_timesteps = 10_000_000_000_000",
+    'env_id = "NoSuchEnv-v0"',
+    'env_id = "os:path"',
+    'env_id = "Blackjack-v1"',
+]
+
+
+@pytest.mark.parametrize("line", IMPOSSIBLE)
+def test_an_impossible_training_is_refused_with_its_line(recipe_file: Path, line: str) -> None:
+    recipe_file.write_text(f'id = "small"\n\n[ppo]\n{line}\n\n[seeds]\ntrain = [0]\n')
+    key = line.split(" ")[0]
+    with pytest.raises(RecipeError, match=rf"ppo\.{key} = .* \(line 4\)"):
+        read_recipe(recipe_file)
+
+
+@pytest.mark.parametrize(
+    "seeds",
+    [
+        "[4_294_967_296]",
+        "[-1]",
+        "[0, 0]",
+        '"0:2,1"',
+        '"0:1000000000000"',
+        '"4294967295:4294967297"',
+        '"5:3"',
+        '""',
+    ],
+)
+def test_impossible_seeds_are_refused_with_their_line(recipe_file: Path, seeds: str) -> None:
+    recipe_file.write_text(f'id = "small"\n[seeds]\nvalidation = []\ntrain = {seeds}\n')
+    with pytest.raises(RecipeError, match=r"seeds\.train = .* \(line 4\)"):
+        read_recipe(recipe_file)
+
+
+def test_the_largest_seed_trains(tmp_path: Path) -> None:
+    dataset = collect(one_seed(2**32 - 1), tmp_path / "dataset")
+    assert [len(run) for run in dataset] == [49]
+
+
+def test_all_that_is_wrong_is_said_at_once(recipe_file: Path) -> None:
+    text = TOML.replace("n_epochs = 2", "n_epochs = 0\ngamma = 2.0").replace("[2, 3]", "[-1]")
+    recipe_file.write_text(text + '[collect]\ncollector = "population"\npopulation = 0\n')
+    with pytest.raises(RecipeError) as told:
+        read_recipe(recipe_file)
+    for said in ("n_epochs = 0 (line 7)", "gamma = 2.0 (line 8)", "seeds.test = [-1] (line 12)"):
+        assert said in str(told.value)
+    assert "collect.population = 0 (line 19)" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('id = "x"\nppo = { n_epochs = 2, gamma = 2.0 }\n', 2),
+        ('id = "x"\nppo.gamma = 2.0\n', 2),
+        ('id = "x"\n[ "ppo" ]  # CleanRL\n\n"gamma"=2.0\n', 4),
+        ('id = "x"\r\n[ppo]\r\nnet_arch = [\r\n8,\r\n8]\r\ngamma = 2.0\r\n', 6),
+        ('id = "x"\nlicence = """\n[ppo]\ngamma = 2.0\n"""\n[ppo]\ngamma = 2.0\n', 7),
+    ],
+)
+def test_a_line_is_found_however_it_is_written(recipe_file: Path, text: str, line: int) -> None:
+    recipe_file.write_bytes(text.encode())
+    with pytest.raises(RecipeError, match=rf"ppo\.gamma = 2\.0 \(line {line}\)"):
+        read_recipe(recipe_file)
+
+
+@pytest.mark.parametrize(
+    ("line", "where"),
+    [("gama = 0.9", "line 4"), ('gamma = "0.9"', "line 4"), ('activation = "gelu"', "line 4")],
+)
+def test_a_key_or_a_type_that_is_wrong_has_its_line(
+    recipe_file: Path, line: str, where: str
+) -> None:
+    recipe_file.write_text(f'id = "small"\n\n[ppo]\n{line}\n')
+    with pytest.raises(RecipeError, match=f"where: .*recipe.toml, {where}"):
+        read_recipe(recipe_file)
+
+
+@pytest.mark.parametrize("text", [f"a = {'9' * 5000}", "a = " + "[" * 5000, "\udcff"])
+def test_a_text_that_cannot_be_read_is_one_clear_error(recipe_file: Path, text: str) -> None:
+    recipe_file.write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(RecipeError, match="no TOML"):
+        read_recipe(recipe_file)
+
+
+def test_an_impossible_recipe_writes_nothing(tmp_path: Path) -> None:
+    for recipe in (
+        replace(SMALL_RECIPE, ppo=replace(SMALL, learning_rate=float("inf"))),
+        replace(SMALL_RECIPE, seeds=Seeds(train=[0, 2**32])),
+    ):
+        with pytest.raises(RecipeError):
+            collect(recipe, tmp_path / "dataset")
+    with pytest.raises(RecipeError, match="invalid seeds"):
+        collect(SMALL_RECIPE, tmp_path / "dataset", seeds=[0, 2**32])
+    assert not list(tmp_path.iterdir())
+
+
+def test_false_leaves_the_change_of_the_value_unclipped(recipe_file: Path) -> None:
+    recipe_file.write_text('id = "small"\n[ppo]\nclip_range_vf = false\n')
+    assert read_recipe(recipe_file).ppo.clip_range_vf is None
 
 
 def test_seeds() -> None:

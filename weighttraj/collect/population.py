@@ -23,6 +23,7 @@ from torch import Tensor
 from weighttraj import environments
 from weighttraj.collect.agents import actor_parameters, critic_parameters
 from weighttraj.collect.learners import Learners, Rollout
+from weighttraj.collect.limits import population_problems
 from weighttraj.collect.networks import MLP, Stack
 from weighttraj.collect.ppo import PPOConfig, make_ppo
 from weighttraj.collect.recorder import Reading
@@ -247,16 +248,12 @@ def check_config(config: PPOConfig) -> None:
     Raises:
         CollectError: it cannot, or the environment is unknown.
     """
-    wrong = {
-        "n_steps": config.n_steps % config.batch_size != 0,
-        "batch_size": config.batch_size % 16 != 0,
-    }
-    if any(wrong.values()):
+    wrong = list(population_problems(config))
+    if wrong:
         raise CollectError(
             "a population cannot train with these settings",
-            expected="n_steps a multiple of batch_size, and that a multiple of 16",
-            got={name: getattr(config, name) for name, is_wrong in wrong.items() if is_wrong},
-            do='change them, or set collector = "sb3" in [collect]',
+            expected="; ".join(f"{problem.key} {problem.expected}" for problem in wrong),
+            got="; ".join(f"{problem.key} = {problem.got}" for problem in wrong),
         )
     env = environments.make(config.env_id)
     check_kernel(env, config.env_id)

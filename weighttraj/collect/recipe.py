@@ -4,68 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
+from weighttraj.collect.limits import Problem, problems_of, seed_problems
 from weighttraj.collect.ppo import PPOConfig
+from weighttraj.collect.seeds import SPLITS, Seeds, parse_seeds
+from weighttraj.collect.settings import Collect, Store
+from weighttraj.collect.toml_lines import line_of
 from weighttraj.errors import RecipeError
-from weighttraj.format.schema import Profile
-
-SPLITS = ("train", "validation", "test")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Seeds:
-    """Seeds of each split: a list, or ranges such as ``"0:30"`` (the end excluded)."""
-
-    train: list[int] | str = field(default_factory=list)
-    """Runs that models are trained on."""
-    validation: list[int] | str = field(default_factory=list)
-    """Runs that choices are made on."""
-    test: list[int] | str = field(default_factory=list)
-    """Runs that only results are computed on."""
-
-    def by_split(self) -> dict[str, list[int]]:
-        """The seeds of each split, ranges written out."""
-        return {name: parse_seeds(getattr(self, name)) for name in SPLITS}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Collect:
-    """Who trains."""
-
-    collector: Literal["sb3", "population"] = "sb3"
-    """``sb3``: Stable-Baselines3, any environment, a run at a time. ``population``: the same
-    training of many seeds at once, several times as fast, for Gymnasium's MuJoCo environments."""
-    population: int = 16
-    """Runs that a population trains at once; more or fewer give the same bytes."""
-
-    @property
-    def block(self) -> int:
-        """Runs that one process makes at once."""
-        return self.population if self.collector == "population" else 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class Store:
-    """What is stored, and how often."""
-
-    every: int = 64
-    """Gradient steps from one snapshot to the next."""
-    critic: bool = False
-    """Store the critic's parameters."""
-    optimizer_moments: bool = False
-    """Store Adam's moments of the policy's parameters."""
-    probe_observations: int = 64
-    """Network inputs kept of each rollout."""
-    block: int = 64
-    """Snapshots in a chunk and in a commit."""
-    profile: Profile = "default"
-    """How a finished run is packed: ``default``, or ``archive``, the smallest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,71 +40,36 @@ class Recipe:
     """What is stored."""
 
     def splits(self) -> dict[int, str]:
-        """The split of each seed.
+        """Return the split of each seed.
 
         Raises:
-            RecipeError: a seed is in two splits.
+            RecipeError: there are no such seeds, or a seed is in two splits.
         """
-        found: dict[int, str] = {}
-        for split, seeds in self.seeds.by_split().items():
-            for seed in seeds:
-                if seed in found:
-                    raise RecipeError(
-                        "a seed is named twice",
-                        expected="each seed once, in one split",
-                        got=f"seed {seed} in {found[seed]} and in {split}",
-                        where=f"[seeds] of recipe {self.id!r}",
-                        do="remove one; a run that is trained on cannot be tested on",
-                    )
-                found[seed] = split
-        return found
+        _refuse(list(seed_problems(self.seeds)), f"recipe {self.id!r}")
+        return {seed: split for split, seeds in self.seeds.by_split().items() for seed in seeds}
 
-    def check(self) -> None:
+    def check(self, where: object = None) -> None:
         """Check that there can be such runs, before any is begun.
+
+        Args:
+            where: what an error names as the place; None: the recipe's id.
 
         Raises:
             RecipeError: there cannot; all that is wrong is said at once.
         """
-        ppo, store = self.ppo, self.store
-        units = (*ppo.net_arch, *(ppo.critic_arch or (1,)))
-        steps = ppo.total_timesteps // max(1, ppo.n_steps) * ppo.n_epochs
-        steps *= -(-ppo.n_steps // max(1, ppo.batch_size))
-        holds = {
-            "ppo.net_arch": (bool(ppo.net_arch) and min(units) >= 1, "layers of at least 1 unit"),
-            "ppo.n_steps": (ppo.n_steps >= 2, "at least 2"),
-            "ppo.total_timesteps": (
-                ppo.total_timesteps >= max(1, ppo.n_steps),
-                f"at least one rollout, n_steps = {ppo.n_steps}",
-            ),
-            "ppo.batch_size": (2 <= ppo.batch_size <= ppo.n_steps, "from 2 to n_steps"),
-            "ppo.n_epochs": (ppo.n_epochs >= 1, "at least 1"),
-            "ppo.learning_rate": (ppo.learning_rate > 0, "above 0"),
-            "ppo.gamma": (0 <= ppo.gamma <= 1, "from 0 to 1"),
-            "ppo.gae_lambda": (0 <= ppo.gae_lambda <= 1, "from 0 to 1"),
-            "collect.population": (self.collect.population >= 1, "at least 1"),
-            "store.every": (
-                store.every >= 1 and (store.every <= steps or not steps),
-                f"from 1 to the {steps} gradient steps of a run",
-            ),
-            "store.block": (store.block >= 1, "at least 1"),
-            "store.probe_observations": (
-                0 <= store.probe_observations <= ppo.n_steps,
-                "from 0 to n_steps",
-            ),
-        }
-        wrong = {name: expected for name, (fine, expected) in holds.items() if not fine}
-        if wrong:
+        try:
+            msgspec.convert(dataclasses.asdict(self), Recipe)
+        except (ValueError, OverflowError) as error:
             raise RecipeError(
-                "there can be no such runs",
-                expected=", ".join(f"{name} {expected}" for name, expected in wrong.items()),
-                got=", ".join(f"{name} = {self._value(name)}" for name in wrong),
-                where=f"recipe {self.id!r}",
-            )
-        self.splits()
+                "the recipe has a value of the wrong type",
+                got=error,
+                where=where or f"recipe {self.id!r}",
+            ) from error
+        _refuse(self.problems(), where or f"recipe {self.id!r}")
 
-    def _value(self, name: str) -> Any:
-        table, _, key = name.partition(".")
-        return getattr(getattr(self, table), key)
+    def problems(self) -> list[Problem]:
+        """Return everything that is wrong with the values, if their types are right."""
+        return problems_of(self.id, self.ppo, self.seeds, self.collect, self.store)
 
 
 def read_recipe(path: str | Path) -> Recipe:
@@ -160,59 +77,55 @@ def read_recipe(path: str | Path) -> Recipe:
 
     Raises:
         FileNotFoundError: there is no such file.
-        RecipeError: it is no TOML, has unknown keys, values of the wrong type or impossible ones.
+        RecipeError: it is no TOML, has unknown keys, values of the wrong type or impossible ones;
+            the lines are named.
     """
     path = Path(path)
     try:
-        document = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise RecipeError("the recipe is no TOML", got=error, where=path) from error
-    _check_keys(document, Recipe, str(path))
+    _check_keys(document, Recipe, path, text)
     ppo = document.get("ppo")
     if isinstance(ppo, dict) and ppo.get("clip_range_vf") is False:
         ppo["clip_range_vf"] = None  # TOML has no null
     try:
         recipe = msgspec.convert(document, Recipe)
-    except msgspec.ValidationError as error:
+    except (ValueError, OverflowError) as error:
+        key = re.search(r"\$\.([\w.]+)", str(error))
         raise RecipeError(
-            "the recipe has a value of the wrong type", got=error, where=path
+            "the recipe has a value of the wrong type",
+            got=error,
+            where=_place(path, text, key[1] if key else ""),
         ) from error
-    recipe.check()
+    _refuse(recipe.problems(), path, text)
     return recipe
 
 
-def parse_seeds(seeds: list[int] | str) -> list[int]:
-    """Return seeds from a list, a range, or several ranges with commas between them.
+def _refuse(problems: list[Problem], where: object, text: str = "") -> None:
+    """Raise RecipeError if there are problems, with their lines in the recipe's text."""
 
-    >>> parse_seeds("3:6")
-    [3, 4, 5]
-    >>> parse_seeds("0:2,30,40:42")
-    [0, 1, 30, 40, 41]
+    def told(problem: Problem) -> str:
+        line = line_of(text, problem.key)
+        return f"{problem.key} = {problem.got}" + (f" (line {line})" if line else "")
 
-    Raises:
-        RecipeError: if it is no such range, or a seed is negative.
-    """
-    try:
-        if isinstance(seeds, str):
-            seeds = [seed for part in seeds.split(",") for seed in _parse_range(part)]
-        if min(seeds, default=0) < 0:
-            raise ValueError
-    except ValueError as error:
+    if problems:
         raise RecipeError(
-            "invalid seeds",
-            expected='a list of integers from 0, a range such as "0:30" (the end excluded), or '
-            'several with commas between them, such as "0:4,30"',
-            got=repr(seeds),
-        ) from error
-    return seeds
+            "the recipe has impossible values",
+            expected="; ".join(f"{problem.key} {problem.expected}" for problem in problems),
+            got="; ".join(map(told, problems)),
+            where=where,
+            do="correct these keys",
+        )
 
 
-def _parse_range(text: str) -> range:
-    start, _, stop = text.partition(":")
-    return range(int(start), int(stop or int(start) + 1))
+def _place(path: Path, text: str, key: str) -> str:
+    line = line_of(text, key)
+    return f"{path}, line {line}" if line else str(path)
 
 
-def _check_keys(table: dict[str, Any], kind: type, where: str) -> None:
+def _check_keys(table: dict[str, Any], kind: type, path: Path, text: str, prefix: str = "") -> None:
     fields = {f.name: f for f in dataclasses.fields(kind)}
     for key, value in table.items():
         if key not in fields:
@@ -221,9 +134,12 @@ def _check_keys(table: dict[str, Any], kind: type, where: str) -> None:
                 "the recipe has a key that nothing reads",
                 expected=sorted(fields),
                 got=repr(key),
-                where=where,
+                where=_place(path, text, f"{prefix}{key}"),
                 do=f"did you mean {near[0]!r}?" if near else "remove it",
             )
         part: Any = fields[key].default_factory
         if isinstance(value, dict) and part in (PPOConfig, Seeds, Collect, Store):
-            _check_keys(value, part, f"{where}, [{key}]")
+            _check_keys(value, part, path, text, f"{prefix}{key}.")
+
+
+__all__ = ["SPLITS", "Collect", "Recipe", "Seeds", "Store", "parse_seeds", "read_recipe"]

@@ -17,7 +17,7 @@ from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.describe import describe_provenance
 from weighttraj.collect.population import Population, origins_of
 from weighttraj.collect.ppo import make_ppo
-from weighttraj.collect.recipe import Recipe, Store
+from weighttraj.collect.recipe import Recipe, Store, parse_seeds
 from weighttraj.collect.tasks import open_recorder
 from weighttraj.errors import CollectError
 from weighttraj.format import Run, open_dataset, open_run
@@ -37,6 +37,7 @@ def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
 
     Raises:
         CollectError: the data set has no recipe, or no run of this seed.
+        RecipeError: there can be no runs of its recipe.
     """
     if n < 1:
         raise CollectError(
@@ -66,6 +67,7 @@ def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
             where=path,
             do="verify the data sets that it was made of",
         ) from error
+    recipe.check(where=path)
     return _compare(runs[0], recipe, min(n, len(runs[0])))
 
 
@@ -90,15 +92,15 @@ def _threads(run: Run) -> int:
 
 
 def _train(run: Run, recipe: Recipe, n: int, path: Path) -> Run:
+    (seed,) = parse_seeds([run.info.seed or 0])
     threads = torch.get_num_threads()
     torch.set_num_threads(_threads(run))
-    cadence = run.info.cadence
-    steps = (cadence.gradient_steps_per_iteration if cadence else None) or 1
+    steps = recipe.ppo.gradient_steps_per_iteration
     iterations = math.ceil((n - 1) * recipe.store.every / steps)
     train = _by_population if recipe.collect.collector == "population" else _by_sb3
     try:
         # The schedules need the whole length, so the training is cut short, not shortened.
-        train(recipe, run.info.seed or 0, iterations * recipe.ppo.n_steps, path)
+        train(recipe, seed, iterations * recipe.ppo.n_steps, path)
     finally:
         torch.set_num_threads(threads)
     return open_run(path)

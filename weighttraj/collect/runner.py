@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from weighttraj.collect.costs import measured
-from weighttraj.collect.population import check_config
-from weighttraj.collect.recipe import Recipe
+from weighttraj.collect.recipe import Recipe, parse_seeds
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
 from weighttraj.engine import Engine, engine_of
 from weighttraj.errors import CollectError, RecipeError, ReplayError, WeightTrajError
@@ -55,23 +54,20 @@ def collect(
         console: where progress is shown; None: nowhere.
 
     Raises:
-        CollectError: the folder holds another data set, a run failed, or a population cannot train
-            with the recipe's settings.
+        CollectError: the folder holds another data set, or a run failed.
         EngineError: there are no workers, or no scheduler answers.
         RecipeError: there can be no such runs, or none are asked for.
         KeyboardInterrupt: it was stopped; what was committed stays.
     """
     import_modules(imports)
     recipe.check()
-    wanted = set(recipe.splits() if seeds is None else seeds)
+    wanted = set(recipe.splits() if seeds is None else parse_seeds(seeds))
     if not wanted:
         raise RecipeError(
             "there is nothing to collect",
             expected="seeds, in the recipe's [seeds] or from --seeds",
             where=f"recipe {recipe.id!r}",
         )
-    if recipe.collect.collector == "population":
-        check_config(recipe.ppo)
     out = Path(out).absolute()
     console = console or Console(quiet=True)
     # The engine is closed first: then the seconds of its processes are known.
