@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import shlex
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -117,3 +119,30 @@ def test_evaluate(reader: Path) -> None:
     names = run_page(DOCS / "evaluate.md", {"--quick": QUICKER, "--episodes 5": "--episodes 1"})
     assert names["after"] > names["before"] + 100
     assert "half-step" in names["results"]["forecasters"]
+
+
+def test_the_page_of_what_is_supported_says_what_was_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(DOCS))
+    supported = importlib.import_module("supported")
+    results, page = json.loads(supported.FILE.read_text()), supported.PAGE.read_text()
+    assert supported.insert(page, results) == page, "stale: run docs/supported.py --render"
+    assert {title: list(rows) for title, rows in results["rows"].items()} == {
+        title: list(rows) for title, rows in supported.ROWS.items()
+    }
+    results["rows"]["Policies (PPO, Pendulum)"]["tanh"]["recorded"] = "no: for this test"
+    assert "for this test" in supported.insert(page, results)
+
+
+@pytest.mark.parametrize("name", ["PPO", "RecurrentPPO"])
+def test_a_row_of_what_is_supported_comes_out_the_same_again(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(DOCS))
+    supported = importlib.import_module("supported")
+    title = next(iter(supported.ROWS))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        row = supported.attempt(supported.ROWS[title][name])
+    assert row == json.loads(supported.FILE.read_text())["rows"][title][name]
