@@ -14,6 +14,7 @@ import torch
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -331,6 +332,33 @@ def test_a_recurrent_policy_is_recorded_and_the_trainer_is_told_at_the_start(
         assert np.array_equal(stored[name], parameter.detach().numpy())
     with pytest.raises(PolicyError, match=r"lstm_actor"):
         run.load_policy()
+
+
+class Later(ActorCriticPolicy):
+    """Acts otherwise once its gain, which is no parameter, has changed."""
+
+    gain = 1.0
+
+    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Any:
+        return super()._get_action_dist_from_latent(latent_pi * self.gain)
+
+
+class RaisesTheGain(BaseCallback):
+    def _on_step(self) -> bool:
+        self.model.policy.gain += 0.1  # type: ignore[operator,assignment]
+        return True
+
+
+def test_a_policy_that_acts_otherwise_at_the_end_is_found_there(tmp_path: Path) -> None:
+    model = A2C(Later, "Pendulum-v1", seed=0, device="cpu", policy_kwargs={"net_arch": [4]})
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=1)
+    with pytest.warns(UserWarning, match="acts otherwise than the agent"):
+        model.learn(20, callback=[callback, RaisesTheGain()])
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert run.info.status == "complete"
+    assert wt.verify(run.path) == []
+    with pytest.raises(PolicyError, match="acts otherwise than the agent"):
+        run.load_policy(0)
 
 
 def test_training_is_the_same_with_the_comparison_and_without() -> None:

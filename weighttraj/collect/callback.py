@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 from weighttraj.collect.agents import Agent, Unit, find_agent
-from weighttraj.collect.describe import describe_run, diagnostics_of
+from weighttraj.collect.describe import describe_agent, describe_run, diagnostics_of
 from weighttraj.collect.guard import Guard
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.origin import find_origin, find_source
@@ -284,9 +284,19 @@ class WeightTrajectoryCallback(BaseCallback):
     def _on_training_end(self) -> None:
         try:
             self._end_update()
+            self._check_again()
             self._recording.end_training(self._diagnostics())
         finally:
             self.close()
+
+    def _check_again(self) -> None:
+        """Compare the rebuilt policy with the agent again: its code may act otherwise by now."""
+        before = self.writer.info.policy
+        reasons = describe_agent(self._agent, self._norm.unknown).cannot_rebuild
+        if reasons and not before.cannot_rebuild:
+            now = replace(before, kind="other", acting="", cannot_rebuild=reasons)
+            self.writer.describe_again(now)
+            _warn_if_lost(self.writer.info, self.path)
 
     @property
     def _recording(self) -> Recorder:

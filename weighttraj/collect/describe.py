@@ -179,7 +179,7 @@ def describe_agent(agent: Agent, unknown_wrappers: tuple[str, ...]) -> PolicySpe
         reasons = find_difference(agent.network, spec, layout, agent.prefix)
     if reasons:
         spec = replace(spec, acting="", layers=(), log_std=(), activation="")
-    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
+    reasons += _changing(unknown_wrappers)
     if unknown_wrappers:
         spec = replace(spec, acting="")
     return replace(spec, cannot_rebuild=tuple(reasons))
@@ -248,8 +248,14 @@ def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]
         reasons = find_difference(policy, spec, describe_layout(actor_parameters(policy), spec))
     if reasons:  # what the layers are for is then unknown
         spec = replace(spec, layers=(), activation="")
-    reasons += [f"environment wrapper {name}" for name in unknown_wrappers]
+    reasons += _changing(unknown_wrappers)
     return replace(spec, kind="other" if reasons else "mlp", cannot_rebuild=tuple(reasons))
+
+
+def _changing(wrappers: tuple[str, ...]) -> list[str]:
+    """Reasons why a policy cannot act outside its wrappers."""
+    change = "which may change observations or actions"
+    return [f"environment wrapper {name}, {change}" for name in wrappers]
 
 
 def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
@@ -266,7 +272,7 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
         reasons.append(f"observations in a {type(space).__name__} space")
     if is_image_space(space):
         reasons.append("observations that SB3 takes for images and scales")
-    if layers:
+    if layers and not reasons:
         wanted = {name for pair in layers for name in pair}
         gaussian = {"log_std"} if head["head"] == "gaussian" else set()
         reasons += _other_parameters(actor_parameters(policy), wanted | gaussian)

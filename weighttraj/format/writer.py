@@ -20,6 +20,7 @@ from weighttraj.format.schema import (
     AXES,
     ArraySpec,
     Axis,
+    PolicySpec,
     Provenance,
     RunInfo,
     Status,
@@ -161,6 +162,10 @@ class RunWriter:
             SnapshotError: the shape is not ``(info.probe_observations, *observation)``.
         """
         self._append("iteration", {"probe/observations": probe_observations})
+
+    def describe_again(self, policy: PolicySpec) -> None:
+        """Replace the description of the policy: it turned out that it acts otherwise."""
+        self._store.commit(replace(self._store.info, policy=policy))
 
     def flush(self, status: Status = "collecting") -> None:
         """Write and commit everything appended so far."""
