@@ -188,9 +188,9 @@ def _pairs(
     twin: BasePolicy, rebuilt: Policy, observations: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield what is compared: its name, what the rebuilt policy gives, what the agent gives."""
-    yield from _predicted(twin, rebuilt, observations)
     if isinstance(twin, ActorCriticPolicy):
         yield from _rolled(twin, rebuilt, observations)
+    yield from _predicted(twin, rebuilt, observations)
 
 
 def _predicted(
