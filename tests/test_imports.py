@@ -86,6 +86,7 @@ ALLOWED = {
     ],
     "weighttraj.format.writer": [
         "weighttraj.errors",
+        REMOTE,
         "weighttraj.format.live",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
@@ -155,6 +156,7 @@ ALLOWED = {
         "weighttraj.errors",
         "weighttraj.environments",
         FORMAT,
+        REMOTE,
         "weighttraj.collect",
         "weighttraj.policies.kernels",
         "weighttraj.policies.policy",
@@ -238,7 +240,7 @@ ALLOWED = {
         "weighttraj.format.tables",
         "weighttraj.registry.croissant",
     ],
-    "weighttraj.registry.transfer": ["weighttraj.format.catalog"],
+    "weighttraj.registry.transfer": ["weighttraj.format.catalog", "weighttraj.remote"],
     "weighttraj.registry.download": [
         "weighttraj.progress",
         "weighttraj.errors",
@@ -266,6 +268,7 @@ ALLOWED = {
         "door weighttraj.format",
         "weighttraj.format.catalog",
         "weighttraj.format.locate",
+        "weighttraj.format.objects",
         "weighttraj.remote",
     ],
     "weighttraj.__main__": ["door weighttraj.cli"],
@@ -448,7 +451,7 @@ ALLOWED = {
         "tipl.zoo",
         "door weighttraj",
     ],
-    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", "weighttraj.terminal"],
+    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", REMOTE, "weighttraj.terminal"],
     "tipl": ["tipl", "weighttraj.errors"],
 }
 

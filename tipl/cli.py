@@ -17,6 +17,7 @@ from rich.table import Table
 
 import weighttraj as wt
 from weighttraj.errors import WeightTrajError
+from weighttraj.remote.address import here, new_path
 from weighttraj.terminal import Output, while_read
 
 try:
@@ -54,6 +55,7 @@ def _train(config: TrainConfig) -> None:
 
     In several processes: ``torchrun --nproc-per-node 2 -m tipl.cli train`` with the same options.
     """
+    new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     tipl.train(config, console=console)
     if rank_here() == 0:
@@ -64,6 +66,7 @@ def _train(config: TrainConfig) -> None:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _train_gate(config: GateTrainConfig) -> None:
     """Train tipl-gate on the training runs of one or several data sets, or go on; minutes."""
+    new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     train_gate(config, console=console)
     print(f"model in {config.out}")
@@ -73,6 +76,7 @@ def _train_gate(config: GateTrainConfig) -> None:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _train_drift(config: DriftConfig) -> None:
     """Choose how far to go along a forecast, a tipl-gate's, say, by returns of validation runs."""
+    new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     drift = train_drift(config, console=console)
     print(f"model in {config.out}: {drift.amplitudes}")
@@ -82,6 +86,7 @@ def _train_drift(config: DriftConfig) -> None:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _train_causal(config: CausalTrainConfig) -> None:
     """Train tipl-causal on the training runs of one or several data sets, or go on."""
+    new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     train_causal(config, console=console)
     print(f"model in {config.out}")
@@ -98,6 +103,7 @@ def _fit(
     steps: Annotated[int, tyro.conf.arg(help="gradient steps of each small network")] = 2000,
 ) -> None:
     """Fit the ladder of baselines to the training runs of a data set; minutes on one core."""
+    new_path(out)
     dataset = wt.open_dataset(data)
     train = dataset.split("train").runs
     validation = [run for run in dataset if run.split == "validation"]
@@ -142,6 +148,7 @@ class _Evaluate(EvaluateConfig):
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _evaluate(args: _Evaluate) -> None:
     """Judge forecasters on unseen runs beside a copy of the last weights; writes a report."""
+    new_path(args.out)
     forecasters = [tipl.load(name) for name in args.forecasters]
     config = EvaluateConfig(
         **{field.name: getattr(args, field.name) for field in fields(EvaluateConfig)}
@@ -171,7 +178,7 @@ def _check(
     Whether it finds something in random walks, looks ahead, follows permuted and flipped units and
     longer steps, and goes on along a line.
     """
-    if out.is_dir():
+    if new_path(out).is_dir():
         raise IsADirectoryError(f"--out {out} is a folder: name a JSON file")
     found = check_model(
         tipl.load(model),
@@ -214,7 +221,7 @@ def _release(
     log: Annotated[bool, tyro.conf.arg(help="keep some lines of the training's log")] = True,
 ) -> None:
     """Put a model into the zoo: once as a draft, and with its results after it was judged there."""
-    out = release(folder, name, results=results, checks=checks, log=log)
+    out = release(here(folder), name, results=results, checks=checks, log=log)
     print(f"model in {out}")
     if read_metrics(out) is None:
         print(f"a draft: judge it with `tipl evaluate {name} ...`, then give --results")
@@ -226,7 +233,7 @@ def _card(
     out: Annotated[Path, tyro.conf.arg(help="folder of the cards")] = Path("cards/models"),
 ) -> None:
     """Write the card of a model, or the figures of its metrics.json into the card that is there."""
-    print(f"card in {write_card(name, out)}")
+    print(f"card in {write_card(name, new_path(out))}")
 
 
 @app.command(name="push")
@@ -256,7 +263,7 @@ def _report(
     ] = None,
 ) -> None:
     """Write the page and figures of a result file again, or its places in a Markdown page."""
-    document = read_results(results)
+    document = read_results(here(results))
     if into is not None:
         report.insert_markdown(document, results, into)
         print(f"results in {into}")

@@ -20,7 +20,7 @@ from weighttraj.errors import RegistryError, WeightTrajError
 from weighttraj.format.lint import lint_returns
 from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.plugins import import_modules
-from weighttraj.remote import is_remote
+from weighttraj.remote import RemotePath, here, is_remote
 from weighttraj.terminal import Output, while_read
 
 Imports = Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")]
@@ -54,7 +54,7 @@ def _collect(args: _Collect) -> None:
     """Collect the data set of a recipe, or go on where it stopped."""
     from weighttraj.collect.recipe import parse_seeds
 
-    recipe = wt.collect.read_recipe(args.recipe)
+    recipe = wt.collect.read_recipe(here(args.recipe))
     out = args.out or Path(COLLECTED) / recipe.id
     seeds = None if args.seeds is None else parse_seeds(args.seeds)
     dataset = wt.collect.collect(
@@ -72,7 +72,7 @@ def _collect(args: _Collect) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Returns:
-    path: tyro.conf.Positional[Path]
+    path: tyro.conf.Positional[str]
     """Data set (path or id) or run."""
     episodes: int = 10
     """Episodes for each action mode; the same seeds for every policy."""
@@ -144,10 +144,10 @@ def _show(
 ) -> None:
     """Print what a data set or a run holds."""
     if is_remote(path):
-        is_run = path.removesuffix(".zip").endswith(".zarr")
+        is_run = RemotePath.parse(path).name.removesuffix(".zip").endswith(".zarr")
     else:
-        here = locate(path)
-        is_run = not (here / "dataset.json").is_file() and here.suffix != ".h5"
+        place = locate(path)
+        is_run = not (place / "dataset.json").is_file() and place.suffix != ".h5"
     if not is_run:
         print(wt.open(path))
         return
@@ -279,7 +279,7 @@ def _select(
 
 @app.command(name="split")
 def _split(
-    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set: path or id")],
+    path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set: path or id")],
     out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
     fractions: Annotated[
         tuple[float, float, float], tyro.conf.arg(help="of the runs: training, validation, test")
@@ -378,7 +378,7 @@ def _sure(question: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class _Verify:
-    path: tyro.conf.Positional[Path]
+    path: tyro.conf.Positional[str]
     """Data set (path or id) or run."""
     deep: bool = False
     """Decode every array, also where the manifest vouches for the bytes."""
@@ -404,18 +404,18 @@ def _verify(args: _Verify) -> None:
 
 @app.command(name="lint")
 def _lint(
-    path: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="data set (path or id) or run")],
+    path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set (path or id) or run")],
 ) -> None:
     """Is it what it says it is? Look for duplicates, gaps, jumps; exit with 1 on findings."""
-    path = locate(path)
+    place = locate(path)
     _finish(
-        path, [str(finding) for finding in wt.lint(path, console=console)], "nothing suspicious"
+        place, [str(finding) for finding in wt.lint(place, console=console)], "nothing suspicious"
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Repair:
-    path: tyro.conf.Positional[Path]
+    path: tyro.conf.Positional[str]
     """Data set (path or id) or run."""
     cut: bool = False
     """Drop damaged snapshots and those after them; collecting again makes them anew."""
@@ -433,7 +433,7 @@ def _repair(args: _Repair) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pack:
-    path: tyro.conf.Positional[Path]
+    path: tyro.conf.Positional[str]
     """Finished run."""
     profile: Literal["default", "archive"] = "default"
     """``default``: any Zarr v3 reader; ``archive``: smallest, lossless too, needs PCodec."""
@@ -450,7 +450,7 @@ def _pack(args: _Pack) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    path: tyro.conf.Positional[Path | None] = None
+    path: tyro.conf.Positional[str | None] = None
     """Data set (path or id) or run."""
     all: bool = False
     """A gallery: pages of all data sets that `list` shows, of models by their cards, an index."""
@@ -507,7 +507,7 @@ def _gallery(args: _Report) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Export:
-    path: tyro.conf.Positional[Path]
+    path: tyro.conf.Positional[str]
     """Run; for hdf5 also a data set."""
     to: Literal["hdf5", "npy", "safetensors", "sb3"]
     """hdf5: one file with everything; npy: weights.npy and tables; safetensors: one snapshot;
@@ -536,11 +536,11 @@ def _export(args: _Export) -> None:
 
 @app.command(name="import")
 def _import(
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="HDF5 file of an export")],
+    file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="HDF5 file of an export")],
     out: Annotated[Path, tyro.conf.arg(help="folder of the data set to be written")],
 ) -> None:
     """Make a data set of an HDF5 file that `export` wrote; every digest is checked."""
-    print(wt.open(wt.import_hdf5(file, out)))
+    print(wt.open(wt.import_hdf5(here(file), out)))
 
 
 @app.command(name="cache")

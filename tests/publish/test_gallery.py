@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import html
+import os
 import re
 import shutil
 import subprocess
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
+from rich.console import Console
 
 from weighttraj import cli
 from weighttraj.errors import StoreExistsError
-from weighttraj.publish.gallery import as_html, gallery
+from weighttraj.publish.gallery import MAX_CARD, as_html, gallery, page_name
 from weighttraj.registry import LocalDataset, write_card
 
 CARD = """---
@@ -53,14 +56,14 @@ def test_every_link_leads_to_a_page(place: Path) -> None:
     index = make(place)
     pages = sorted(page.relative_to(place / "out").as_posix() for page in index.parent.rglob("*"))
     assert pages == [
-        *("cards", "cards/a-model.html", "cards/a-model.svg", "cards/small.html"),
-        *("cards/team__small.html", "data", "data/small.html", "data/team__small.html"),
-        "index.html",
+        *("cards", "cards/small.html", "cards/team~small.html"),
+        *("data", "data/small.html", "data/team~small.html", "index.html"),
+        *("models", "models/a-model", "models/a-model.html", "models/a-model/a-model.svg"),
     ]
     for page in index.parent.rglob("*.html"):
         for link in re.findall(r'(?:href|src)="([^"#]+)"', page.read_text()):
             if not link.startswith(("https:", "data:")):
-                assert (page.parent / link).is_file() or link == "../secret.svg", link
+                assert (page.parent / link).is_file(), link
 
 
 def test_the_index_says_what_there_is(place: Path) -> None:
@@ -73,7 +76,7 @@ def test_the_index_says_what_there_is(place: Path) -> None:
 
 def test_cards_are_text_not_code(place: Path) -> None:
     make(place)
-    text = (place / "out/cards/a-model.html").read_text()
+    text = (place / "out/models/a-model.html").read_text()
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(1)" in text
     assert "facts -->" not in text
@@ -85,6 +88,81 @@ def test_markdown() -> None:
     page, pictures = as_html("[a](b.md) [c](https://d) ![e](f.svg)")
     assert page == '<p>a <a href="https://d">c</a> <img src="f.svg" alt="e" /></p>\n'
     assert pictures == ["f.svg"]
+
+
+def test_pages_of_two_ids_are_two() -> None:
+    names = ["ns/x", "ns__x", "ns~x", "ns%2Fx", "ns x", "ns#x", "caf\u00e9", "cafe\u0301"]
+    names += ["a" * 250, "a" * 249 + "b", "\u00e9" * 120]
+    pages = [page_name(name) for name in names]
+    assert len({page.lower() for page in pages}) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z0-9._~%-]{1,200}", page) for page in pages)
+
+
+def test_odd_ids_have_pages_that_their_links_lead_to(place: Path) -> None:
+    datasets = dict.fromkeys(("ns/x", "ns__x", "a b#c%20?"), place / "small")
+    index = gallery(datasets, place / "out", film=False)
+    links = re.findall(r'href="([^"#]+)"', index.read_text())
+    assert len(set(links)) == 6
+    assert all((index.parent / unquote(link)).is_file() for link in links)
+
+
+def test_a_card_of_data_and_one_of_a_model_are_two_pages(place: Path) -> None:
+    shutil.copyfile(place / "cards/a-model.md", place / "cards/small.md")
+    cards = [place / "cards/small.md"]
+    index = gallery({"small": place / "small"}, place / "out", cards=cards, film=False)
+    assert "a-model" in (index.parent / "models/small.html").read_text()
+    assert "a-model" not in (index.parent / "cards/small.html").read_text()
+
+
+def test_what_a_link_leads_to_is_not_published(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "secret.md").write_text("# my secret")
+    (place / "secret.svg").write_text("<svg>my secret</svg>")
+    for file in (place / "small/README.md", place / "cards/b-model.md"):
+        file.unlink(missing_ok=True)
+        file.symlink_to(place / "secret.md")
+    (place / "cards/linked.svg").symlink_to(place / "secret.svg")
+    with (place / "cards/a-model.md").open("a") as card:
+        card.write("\n![a link](linked.svg) ![another page](b-model.md)\n")
+    cards = sorted((place / "cards").glob("*.md"))
+    index = gallery(
+        {"small": place / "small"}, place / "out", cards=cards, film=False, console=Console()
+    )
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("left out: refused to read a file") == 2
+    assert not (place / "out/data").exists()
+    assert "a link another page" in (index.parent / "models/a-model.html").read_text()
+    pages = [page for page in index.parent.rglob("*") if page.is_file()]
+    assert not [page for page in pages if b"my secret" in page.read_bytes()]
+
+
+def test_pictures_of_one_name_are_those_of_their_cards(place: Path) -> None:
+    other = place / "others/b-model.md"
+    other.parent.mkdir()
+    other.write_text("# b\n\n![picture](a-model.svg) ![odd](<my pic%20.svg>)")
+    (other.parent / "a-model.svg").write_text("<svg>b</svg>")
+    (other.parent / "my pic .svg").write_text("<svg>odd</svg>")
+    cards = [place / "cards/a-model.md", other]
+    index = gallery({}, place / "out", cards=cards, film=False)
+    for name, content in {
+        "a-model": ["<svg/>"],
+        "b-model": ["<svg>b</svg>", "<svg>odd</svg>"],
+    }.items():
+        page = index.parent / f"models/{name}.html"
+        shown = re.findall(r'src="([^"]+)"', page.read_text())
+        assert [(page.parent / unquote(src)).read_text() for src in shown] == content
+
+
+def test_cards_that_are_no_text_or_too_large_are_left_out(place: Path) -> None:
+    (place / "cards/b.md").write_bytes(b"\xff\xfe")
+    (place / "cards/c.md").write_bytes(b"<!--" * MAX_CARD)
+    os.mkfifo(place / "cards/d.md")
+    (place / "cards/e.md").write_bytes(b"<!--" * (MAX_CARD // 4))
+    cards = sorted((place / "cards").glob("*.md"))
+    index = gallery({}, place / "out", cards=cards, film=False)
+    pages = sorted(page.name for page in (index.parent / "models").glob("*.html"))
+    assert pages == ["a-model.html", "e.html"]
 
 
 def test_it_is_written_again_but_nothing_else_is_replaced(place: Path) -> None:

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import boto3
 import huggingface_hub.constants
+import numpy as np
 import pytest
 
 import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote import servers
+from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo
+from weighttraj.format.catalog import write_dataset_info
 from weighttraj.registry import create
 from weighttraj.remote.store import store_at
 
@@ -22,10 +25,16 @@ CREDENTIALS = {"aws_access_key_id": "key", "aws_secret_access_key": "secret"}
 
 
 @pytest.fixture(autouse=True)
-def patient_for_seconds_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A server that is gone is waited for a minute; not here. Downloads go to a test's store."""
-    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "2")
+def a_store_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Downloads go to a test's store."""
+    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "30")
     monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(tmp_path / "store"))
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that is gone is waited for a minute; not here."""
+    monkeypatch.setenv("WEIGHTTRAJ_REMOTE_TIMEOUT", "2")
 
 
 @pytest.fixture(scope="session")
@@ -34,6 +43,27 @@ def published(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     path = tmp_path_factory.mktemp("published") / "small-v1"
     shutil.copytree(small_dataset, path)
     (path / "README.md").write_text(CARD)
+    wt.seal(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A packed run and one that is a folder, of no training. Do not write to it."""
+    path = tmp_path_factory.mktemp("tiny") / "tiny"
+    entries = (RunEntry(id="a", path="runs/a.zarr.zip"), RunEntry(id="b", path="runs/b.zarr"))
+    layout, rng = ParamLayout.of({"w": ((3,), "other", ("fixed",))}), np.random.default_rng(0)
+    for entry in entries:
+        folder = path / f"runs/{entry.id}.zarr"
+        with wt.RunWriter(folder, RunInfo(run_id=entry.id, layout=layout, block=2)) as writer:
+            for t in range(5):
+                writer.append(rng.normal(size=3).astype(np.float32), num_timesteps=t)
+    wt.pack(path / "runs/a.zarr")
+    shutil.rmtree(path / "runs/a.zarr")
+    for lock in path.rglob("*.lock"):
+        lock.unlink()
+    (path / "README.md").write_text(CARD)
+    write_dataset_info(path, DatasetInfo(id="tiny", runs=entries, status="complete"))
     wt.seal(path)
     return path
 

@@ -13,6 +13,7 @@ import http.server
 import json
 import re
 import threading
+import time
 import urllib.parse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -55,6 +56,8 @@ class Hub:
     large: dict[str, bytes] = field(default_factory=dict)
     log: list[tuple[str, str]] = field(default_factory=list)
     faults: list[tuple[str, int]] = field(default_factory=list)
+    slow: float = 0
+    """Seconds before each answer."""
 
     def files(self, repository: str, revision: str = "main") -> dict[str, bytes]:
         found = self.repositories[repository]
@@ -94,7 +97,8 @@ class Answer:
 
     def __init__(self, hub: Hub, handler: http.server.BaseHTTPRequestHandler) -> None:
         self.hub, self.handler = hub, handler
-        self.path = urllib.parse.unquote(urllib.parse.urlsplit(handler.path).path)
+        self.quoted = urllib.parse.urlsplit(handler.path).path
+        self.path = urllib.parse.unquote(self.quoted)
         self.body = handler.rfile.read(int(handler.headers.get("Content-Length") or 0))
         if handler.headers.get("Transfer-Encoding") == "chunked":
             self.body = b"".join(_chunks(handler.rfile))
@@ -102,15 +106,17 @@ class Answer:
 
     def go(self) -> None:
         method = self.handler.command
+        time.sleep(self.hub.slow)
         self.hub.log.append((method, self.path))
         for index, (pattern, status) in enumerate(self.hub.faults):
             if re.search(pattern, self.path):
                 del self.hub.faults[index]
                 return self.json({"error": "told to fail"}, status)
         for pattern, methods, do in ROUTES:
-            match = re.fullmatch(pattern, self.path)
+            match = re.fullmatch(pattern, self.quoted)  # a quoted slash is part of a revision
             if match is not None and method in methods:
-                return do(self, **match.groupdict())
+                found = match.groupdict().items()
+                return do(self, **{k: v and urllib.parse.unquote(v) for k, v in found})
         return self.json({"error": f"no such route: {method} {self.path}"}, 404)
 
     # Answers

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -34,6 +35,21 @@ class Request:
     sent: int
 
 
+@dataclass(frozen=True)
+class Long:
+    """A fault: the answer is announced to have so many bytes, and has them."""
+
+    size: int
+
+
+@dataclass(frozen=True)
+class Drip:
+    """A fault: the bytes of the answer come a few at a time, with a pause before them."""
+
+    pause: float
+    bytes_at_once: int = 1
+
+
 @dataclass
 class FileServer:
     """A folder over HTTP, with ranges; counts what it is asked, and misbehaves as it is told."""
@@ -45,9 +61,11 @@ class FileServer:
     faults: list[tuple[str, Any]] = field(default_factory=list)
     """What to do wrong, once each: a pattern of the path, and a status, ``cut`` or a change."""
     url: str = ""
+    needs: str = ""
+    """The query without which nothing is found."""
 
     def fault(
-        self, pattern: str, what: int | str | Callable[[bytes], bytes], times: int = 1
+        self, pattern: str, what: int | str | Long | Drip | Callable[[bytes], bytes], times: int = 1
     ) -> None:
         self.faults += [(pattern, what)] * times
 
@@ -105,14 +123,13 @@ class Server(http.server.ThreadingHTTPServer):
 
 
 def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> None:
-    path, span = handler.path, handler.headers.get("Range")
-    file, fault = server.folder / path.lstrip("/"), server.take(path)
-    if isinstance(fault, int) or not file.is_file():
-        status = fault if isinstance(fault, int) else 404
+    path, _, query = handler.path.partition("?")
+    span, fault = handler.headers.get("Range"), server.take(path)
+    file = server.folder / urllib.parse.unquote(path).lstrip("/")
+    found = file.is_file() and query == server.needs
+    if isinstance(fault, int | Long) or not found:
         server.log.append(Request(handler.command, path, span, 0))
-        _head(handler, status, {"Content-Length": "4"})
-        if handler.command == "GET":
-            handler.wfile.write(b"none")
+        _something_else(handler, fault)
         return
     content = file.read_bytes()
     size, start, stop, status = len(content), 0, len(content), 200
@@ -137,9 +154,32 @@ def answer(handler: http.server.BaseHTTPRequestHandler, server: FileServer) -> N
         part = part[: len(part) // 2] if fault == "cut" else part
         server.log.append(Request(handler.command, path, span, len(part)))
         with contextlib.suppress(ConnectionError):
-            handler.wfile.write(part)
+            if isinstance(fault, Drip):
+                _drip(handler, part, fault)
+            else:
+                handler.wfile.write(part)
     if fault == "cut":
         handler.close_connection = True
+
+
+def _something_else(handler: http.server.BaseHTTPRequestHandler, fault: Any) -> None:
+    """Answer without looking at the file."""
+    if not isinstance(fault, Long):
+        _head(handler, fault if isinstance(fault, int) else 404, {"Content-Length": "4"})
+        if handler.command == "GET":
+            handler.wfile.write(b"none")
+        return
+    _head(handler, 200, {"Content-Length": str(fault.size)})
+    with contextlib.suppress(ConnectionError):
+        while handler.command == "GET":
+            handler.wfile.write(bytes(1 << 20))
+
+
+def _drip(handler: http.server.BaseHTTPRequestHandler, content: bytes, how: Drip) -> None:
+    for start in range(0, len(content), how.bytes_at_once):
+        time.sleep(how.pause)
+        handler.wfile.write(content[start : start + how.bytes_at_once])
+        handler.wfile.flush()
 
 
 def _head(

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tipl
 import weighttraj as wt
 from tests.remote import servers
 from tests.remote.conftest import Bucket, files_of, objects_of
@@ -32,7 +33,13 @@ from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo, RunWr
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.registry.download import source_of
 from weighttraj.registry.upload import CLAIM
-from weighttraj.remote.store import store_at
+from weighttraj.remote import RemotePath
+from weighttraj.remote.store import RemoteStore, store_at
+
+
+def store_of(address: str) -> RemoteStore:
+    return store_at(RemotePath.parse(address).root)
+
 
 # Upload
 
@@ -46,7 +53,7 @@ def test_what_is_published_is_what_is_here(bucket: Bucket, published: Path) -> N
 
 
 def test_the_list_of_runs_is_written_last(moto_bucket: Bucket, published: Path) -> None:
-    store, seen = store_at(moto_bucket.address), []
+    store, seen = store_of(moto_bucket.address), []
     write = store.write
 
     def watched(name: str, content: bytes | Path, *, new: bool = False) -> bool:
@@ -71,7 +78,7 @@ def test_what_is_published_stays(bucket: Bucket, published: Path, large: Path) -
 
 
 def test_another_upload_is_not_disturbed(bucket: Bucket, published: Path, large: Path) -> None:
-    store_at(bucket.address).write(CLAIM, (large / "MANIFEST.sha256").read_bytes())
+    store_of(bucket.address).write(CLAIM, (large / "MANIFEST.sha256").read_bytes())
     with pytest.raises(RegistryError, match=r"(?s)something else is being uploaded.*UPLOADING"):
         wt.upload(published, bucket.address)
     assert list(objects_of(bucket)) == [CLAIM]
@@ -82,7 +89,7 @@ def test_another_upload_is_not_disturbed(bucket: Bucket, published: Path, large:
 def test_what_lies_there_from_before_is_written_over(bucket: Bucket, published: Path) -> None:
     """Whoever takes back the list of runs publishes anew; sizes say nothing of what lies there."""
     wt.upload(published, bucket.address)
-    store = store_at(bucket.address)
+    store = store_of(bucket.address)
     for name in ("dataset.json", "MANIFEST.sha256"):
         store.delete(name)
     readme = (published / "README.md").read_bytes()
@@ -94,7 +101,7 @@ def test_what_lies_there_from_before_is_written_over(bucket: Bucket, published: 
 def test_what_lies_there_from_before_is_not_taken_for_begun(
     bucket: Bucket, published: Path
 ) -> None:
-    store = store_at(bucket.address)
+    store = store_of(bucket.address)
     store.write("README.md", (published / "README.md").read_bytes()[::-1])
     store.write(CLAIM, (published / "MANIFEST.sha256").read_bytes())  # and stopped there
     time.sleep(1.1)  # an S3 server's clock counts seconds
@@ -323,7 +330,7 @@ def test_it_goes_on_where_it_was_stopped(
 ) -> None:
     address, whole = f"{large_server.url}/large-v1", sum(map(len, files_of(large).values()))
     large_server.fault("seed0001", 403)
-    with pytest.raises(RemoteError, match="does not let us"):
+    with pytest.raises(RemoteError, match="access denied"):
         wt.download(address, tmp_path / "here")
     assert not (tmp_path / "here").exists()
     large_server.fault("seed0001", "cut")
@@ -386,6 +393,93 @@ def test_a_file_that_is_not_there(large: Path, tmp_path: Path) -> None:
     (tmp_path / "there/tables/runs.parquet").unlink()
     with servers.FileServer(tmp_path) as server, pytest.raises(DamageError, match="not at the"):
         wt.download(f"{server.url}/there", tmp_path / "here")
+
+
+def without(folder: Path, name: str) -> bytes:
+    """Take a file out of a manifest; returns what that was before."""
+    manifest = folder / "MANIFEST.sha256"
+    before = manifest.read_bytes()
+    lines = before.decode().splitlines(keepends=True)
+    manifest.write_text("".join(line for line in lines if name not in line))
+    return before
+
+
+@pytest.mark.parametrize("name", ["runs/seed0001", "dataset.json"])
+@pytest.mark.parametrize("part", [{}, {"runs": ["seed0001"]}])
+def test_a_manifest_that_leaves_out_what_must_be_there(
+    name: str, part: dict[str, list[str]], published: Path, tmp_path: Path
+) -> None:
+    there, here = tmp_path / "there", tmp_path / "here"
+    shutil.copytree(published, there)
+    before = without(there, name)
+    for _ in range(2):
+        with pytest.raises(DamageError, match=f"(?s)leaves out files.*{name}"):
+            wt.download(there.as_uri(), here, **part)
+        assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    (there / "MANIFEST.sha256").write_bytes(before)
+    dataset = wt.download(there.as_uri(), here, **part)
+    assert len(dataset) == (1 if part else 4)
+    assert wt.verify(here, deep=True) == []
+
+
+def test_a_model_without_its_configuration_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEIGHTTRAJ_MODELS_PATH", str(tmp_path / "models"))
+    there = tmp_path / "gate"
+    tipl.push("tipl-gate-inverted-pendulum-v4", there.as_uri())
+    before = without(there, "config.json")
+    with pytest.raises(DamageError, match=r"(?s)leaves out files.*config\.json"):
+        tipl.load(there.as_uri())
+    (there / "MANIFEST.sha256").write_bytes(before)
+    assert tipl.load(there.as_uri()).name == "gate"
+
+
+def test_links_that_lie_in_the_way_are_not_followed(
+    server: servers.FileServer, published: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "mine").write_text("mine")
+    for name in (".a.download", ".b.download.lock"):
+        (tmp_path / name).symlink_to(other if name == ".a.download" else other / "mine")
+    for name in ("a", "b"):
+        with pytest.raises(FormatError, match="a link lies where"):
+            wt.download(f"{server.url}/small-v1", tmp_path / name)
+    (tmp_path / ".c.download/runs").mkdir(parents=True)
+    (tmp_path / ".c.download/runs/.seed0000.zarr.zip.part").symlink_to(other / "mine")
+    (tmp_path / ".c.download/tables").symlink_to(other)
+    wt.download(f"{server.url}/small-v1", tmp_path / "c")
+    assert files_of(tmp_path / "c") == files_of(published)
+    assert files_of(other) == {"mine": b"mine"}
+
+
+def test_names_that_no_manifest_holds_are_refused_before_anything_changes(
+    published: Path, tmp_path: Path
+) -> None:
+    for name in ("my notes.txt", "caf\u00e9.md", "-x"):
+        path = tmp_path / f"odd{len(name)}"
+        shutil.copytree(published, path)
+        (path / name).write_text("x")
+        before = files_of(path)
+        for change in (wt.registry.write_card, wt.seal):
+            with pytest.raises(FormatError, match=r"(?s)its manifest cannot hold.*rename the file"):
+                change(path)
+            assert files_of(path) == before
+        (path / name).unlink()
+        assert wt.verify(path) == []
+
+
+def test_a_card_that_is_a_link_is_not_published(published: Path, tmp_path: Path) -> None:
+    path, secret = tmp_path / "linked", tmp_path / "secret"
+    shutil.copytree(published, path)
+    secret.write_text("# my secret\n\n## Citation\n")
+    (path / "README.md").unlink()
+    (path / "README.md").symlink_to(secret)
+    for publish in (wt.registry.write_card, lambda p: wt.upload(p, (tmp_path / "out").as_uri())):
+        with pytest.raises(FormatError, match="refused to read a file"):
+            publish(path)
+    assert not (tmp_path / "out").exists()
 
 
 def test_nothing_is_overwritten(server: servers.FileServer, tmp_path: Path) -> None:

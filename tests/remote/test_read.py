@@ -38,7 +38,7 @@ RELEASED = ROOT / "datasets/inverted-pendulum-v4-ppo-v1/data"
 )
 def test_addresses(address: str, root: str, part: str, name: str) -> None:
     place = RemotePath.parse(address)
-    assert (place.root, place.part, place.name) == (root, part, name)
+    assert (str(place.root), place.part, place.name) == (root, part, name)
     assert is_remote(address)
     assert pickle.loads(pickle.dumps(place)) == place  # noqa: S301
 
@@ -48,7 +48,7 @@ def test_a_part_of_an_address() -> None:
     assert place.commit == "a" * 40
     assert place.repository == "hf://org/name"
     assert str(place / "runs" / "x") == f"hf://org/name@{'a' * 40}/runs/x"
-    assert RemotePath.parse("s3://b/a/x.zip").as_object() == RemotePath("s3://b/a", "x.zip")
+    assert RemotePath.parse("s3://b/a/x.zip").as_object() == RemotePath.parse("s3://b/a") / "x.zip"
 
 
 @pytest.mark.parametrize("address", ["ftp://host/a", "hf://name", "hf://a/b@c@d", "s3://", "://x"])
@@ -186,13 +186,14 @@ def test_a_busy_server_is_asked_again(server: servers.FileServer, status: int) -
     assert len(server.log) == 3
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_server_that_stays_busy_is_named(server: servers.FileServer) -> None:
     server.fault("dataset.json", 503, times=1000)
     with pytest.raises(RemoteError, match=r"(?s)cannot be reached.*503.*dataset\.json"):
         wt.open(f"{server.url}/small-v1")
 
 
-@pytest.mark.parametrize("told", ["abc", "", "nan", "inf", "-5", "1e300"])
+@pytest.mark.parametrize("told", ["abc", "", "nan", "inf", "-5", "0", "1e300"])
 def test_a_time_that_is_none_is_refused(
     told: str, server: servers.FileServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,6 +211,7 @@ def test_an_answer_that_breaks_off_is_asked_for_again(
     assert not large_server.faults
 
 
+@pytest.mark.usefixtures("impatient")
 def test_a_server_that_dies(large: Path) -> None:
     with servers.FileServer(large.parent) as dying:
         run = wt.open(f"{dying.url}/large-v1").runs[0]
@@ -300,7 +302,8 @@ def test_azure_which_is_asked_for_no_suffixes(
         same(wt.open("az://container/small-v1"), wt.open(published))
 
 
-@pytest.mark.parametrize(("status", "what"), [(403, "does not let us"), (503, "cannot be reached")])
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize(("status", "what"), [(403, "access denied"), (503, "cannot be reached")])
 def test_a_run_that_cannot_be_had_is_not_asked_for_in_another_way(
     status: int, what: str, server: servers.FileServer
 ) -> None:
@@ -313,7 +316,7 @@ def test_a_run_that_cannot_be_had_is_not_asked_for_in_another_way(
 
 def test_no_credentials(server: servers.FileServer) -> None:
     server.fault("dataset.json", 403)
-    with pytest.raises(RemoteError, match="does not let us"):
+    with pytest.raises(RemoteError, match="access denied"):
         wt.open(f"{server.url}/small-v1")
 
 

@@ -18,7 +18,7 @@ from tipl.zoo import lookup
 from tipl.zoo.card import write_card
 from weighttraj.format.catalog import write_manifest
 from weighttraj.registry.download import download_folder
-from weighttraj.registry.upload import upload_folder
+from weighttraj.registry.upload import repository_of, upload_folder
 from weighttraj.remote import RemotePath, hub
 
 FILES = ("*.json", "*.safetensors", "README.md")
@@ -37,17 +37,19 @@ def fetch(address: str, revision: str | None = None) -> tuple[Path, str]:
         RegistryError: it is no address.
         RemoteError: it cannot be reached.
     """
-    place = RemotePath.parse(address, revision)
+    place = RemotePath.parse(address, revision, kind="models")
     if place.scheme != "hf":
         home = Path(os.environ.get(VARIABLE, "~/.weighttraj/models")).expanduser()
-        folder = home / hashlib.sha256(place.root.encode()).hexdigest()[:16] / place.name
+        folder = home / hashlib.sha256(place.repository.encode()).hexdigest()[:16] / place.name
         if not folder.is_dir():  # it appears when it is whole, and what is published stays
             folder.parent.mkdir(parents=True, exist_ok=True)
-            download_folder(place, folder)
+            download_folder(place, folder, needed=["config.json"])
         return folder, place.name
-    repo, _, at = place.root.removeprefix("hf://").partition("@")
+    root = place.root
     try:
-        found = hub.client().snapshot_download(repo, revision=at, allow_patterns=[*FILES])
+        found = hub.client().snapshot_download(
+            root.host, revision=root.revision, allow_patterns=[*FILES]
+        )
     except (OSError, ValueError, RuntimeError) as error:  # the client's errors are such
         raise hub.hub_error(error, address) from error
     return Path(found), place.name
@@ -77,7 +79,7 @@ def push(
         RegistryError: it is no address, or another model is published there.
         RemoteError: it cannot be reached, or refuses.
     """
-    place = RemotePath.parse(address)
+    place = RemotePath.parse(address, kind="models")
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / "model"
         _write(model, written, card)
@@ -89,7 +91,7 @@ def push(
 
 
 def _push_to_hub(folder: Path, place: RemotePath, private: bool) -> str:
-    client, repo = hub.client(), place.repository.removeprefix("hf://")
+    client, repo = hub.client(), repository_of(place)
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     try:
         api = client.HfApi()
@@ -100,7 +102,7 @@ def _push_to_hub(folder: Path, place: RemotePath, private: bool) -> str:
         info = api.create_commit(repo, adds, commit_message=place.name)
     except (OSError, ValueError, RuntimeError) as error:
         raise hub.hub_error(error, str(place)) from error
-    return f"{place.repository}@{info.oid}"
+    return str(place.at(info.oid))
 
 
 def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None:

@@ -25,6 +25,7 @@ from weighttraj.format.integrity import seal
 from weighttraj.format.storage import PACKED, read_info
 from weighttraj.plugins import import_modules
 from weighttraj.progress import LoggedProgress
+from weighttraj.remote.address import new_path
 
 
 def collect(
@@ -68,7 +69,7 @@ def collect(
             expected="seeds, in the recipe's [seeds] or from --seeds",
             where=f"recipe {recipe.id!r}",
         )
-    out = Path(out).absolute()
+    out = new_path(out).absolute()
     console = console or Console(quiet=True)
     # The engine is closed first: then the seconds of its processes are known.
     with (

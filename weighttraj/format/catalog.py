@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from weighttraj.errors import DamageError
+from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.objects import FolderObjects, check_name, replace_file
 from weighttraj.format.schema import DatasetInfo, load_json, parse, to_json
 from weighttraj.format.storage import checksum
@@ -75,12 +75,36 @@ def write_dataset_info(path: Path, info: DatasetInfo) -> None:
 
 
 def write_manifest(path: Path) -> None:
-    """Write down every object of a data set; nothing may change after it."""
+    """Write down every object of a data set; nothing may change after it.
+
+    Raises:
+        FormatError: a file's name cannot stand in a manifest; see ``check_file_names``.
+    """
+    check_file_names(path)
     lines = []
     for name in sorted(_objects(path)):
         line = _line(FolderObjects(path), name)
         lines.append(f"{line.sha256}  {line.size}  {line.path}\n")
     replace_file(path / MANIFEST, "".join(lines).encode())
+
+
+def check_file_names(path: Path) -> None:
+    """Check that a manifest can hold the names of all files of a data set.
+
+    Raises:
+        FormatError: it cannot.
+    """
+    for name in _objects(path):
+        try:
+            check_name(name, path)
+        except FormatError as error:
+            raise FormatError(
+                "a file of the data set has a name that its manifest cannot hold",
+                expected="letters of ASCII, digits, '.', '_', '-', not beginning with '.' or '-'",
+                got=repr(name),
+                where=path,
+                do="rename the file, or put it elsewhere; hidden files stay and are not published",
+            ) from error
 
 
 def read_manifest(path: Path) -> list[ManifestLine]:

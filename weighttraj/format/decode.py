@@ -21,6 +21,7 @@ from weighttraj.format.codecs import BLOCK_BYTES, MAX_RATIO, PLAIN, explodes, un
 from weighttraj.format.objects import Objects, missing_object
 
 _MISSING = 2**64 - 1
+_OVERHEAD = 1 << 20  # bytes of an object beside its chunks, at most
 
 _WHOLE_BYTES = BLOCK_BYTES
 """Stored bytes up to which a shard is read at once, while a writer may replace it. Larger ones hold
@@ -138,10 +139,10 @@ class RowDecoder:
         """First element and bytes of each chunk in an object."""
         corner = tuple(i * c for i, c in zip(index, self._outer, strict=True))
         if not self._sharded:
-            yield corner, memoryview(self._bytes(index))
+            yield corner, memoryview(self._bytes(index, 0, self._most()))
             return
         size = self._objects.size(self._key(index)) or 0
-        content = self._bytes(index) if size <= _WHOLE_BYTES else None
+        content = self._bytes(index, 0, self._most()) if size <= _WHOLE_BYTES else None
         counts = [o // c for o, c in zip(self._outer, self._chunk, strict=True)]
         head = 16 * math.prod(counts) + 4
         start = self._bytes(index, 0, head) if content is None else content[:head]
@@ -160,7 +161,11 @@ class RowDecoder:
                 else:
                     yield inner, memoryview(content)[offset : offset + length]
 
-    def _bytes(self, index: tuple[int, ...], start: int = 0, stop: int | None = None) -> bytes:
+    def _most(self) -> int:
+        """Return how many bytes an object may have: more than what it decodes to is no data."""
+        return int(2 * math.prod(self._outer) * self._dtype.itemsize) + _OVERHEAD
+
+    def _bytes(self, index: tuple[int, ...], start: int, stop: int) -> bytes:
         """The bytes of an object that must be there, or some of them."""
         content = self._objects.read(self._key(index), start, stop)
         if content is None:

@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from weighttraj.remote.address import RemotePath, is_remote
+from weighttraj.remote.address import Place, here
 
 VARIABLE = "WEIGHTTRAJ_DATASETS_PATH"
 """Environment variable: folders that hold data sets, as in PATH."""
@@ -15,10 +15,11 @@ HOME = "~/.weighttraj/datasets"
 COLLECTED = "data"
 """Where data sets are collected, below the working directory."""
 
-_ID = re.compile(r"([A-Za-z0-9][A-Za-z0-9._-]{0,127}/)?[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_ID = re.compile(r"([^/\0.][^/\0]{0,199}/)?[^/\0.][^/\0]{0,199}")
+"""What can be an id here: the name of a folder, or of one in another, that is not hidden."""
 
 
-def locate(path: str | Path) -> Path:
+def locate(path: str | Place) -> Path:
     """Return the path of a data set: the path itself, or where the data set of an id lies.
 
     A folder that is no data set but holds one in ``data``, as ``datasets/<id>`` of a clone does,
@@ -34,12 +35,11 @@ def locate(path: str | Path) -> Path:
         RegistryError: it is an address, and what is asked for needs files on this machine.
     """
     name = str(path)
-    if is_remote(name):
-        os.fspath(RemotePath.parse(name))  # raises, and says how to have it here
-    if Path(path).exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
-        inner = Path(path) / "data"
-        outer = (Path(path) / "dataset.json").is_file() or (Path(path) / "zarr.json").is_file()
-        return inner if not outer and (inner / "dataset.json").is_file() else Path(path)
+    path = here(path)
+    if path.exists() or _ID.fullmatch(name) is None or name.endswith(".h5"):
+        inner = path / "data"
+        outer = (path / "dataset.json").is_file() or (path / "zarr.json").is_file()
+        return inner if not outer and (inner / "dataset.json").is_file() else path
     places = [folder / name / part for folder in folders() for part in ("", "data")]
     for place in places:
         if (place / "dataset.json").is_file():

@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from weighttraj.errors import DamageError, FormatError, StoreExistsError, WeightTrajError
-from weighttraj.remote.address import Place
+from weighttraj.remote.address import Place, new_path
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
 _PIECE_BYTES = 4 << 20
 
+MAX_DIRECTORY = 64 << 20
+"""Bytes of a zip file's directory, at most: half a million members."""
 MAX_NAME = 200
 """Characters between two slashes of a name: file systems take 255, drafts have longer ones."""
 
@@ -277,6 +279,8 @@ class _BlobFile(io.RawIOBase):
 
     def read(self, count: int = -1) -> bytes:
         stop = self._blob.size if count < 0 else min(self._at + count, self._blob.size)
+        if stop - self._at > MAX_DIRECTORY:
+            raise OSError(f"its directory has more than {MAX_DIRECTORY} bytes")
         content = self._blob.read(self._at, stop) if self._at < stop else b""
         self._at += len(content)
         return content
@@ -310,12 +314,13 @@ def check_name(name: str, where: object) -> str:
 
 
 def refuse_existing(path: Path, do: str = "choose another path, or delete it") -> None:
-    """Nothing is overwritten.
+    """Refuse to overwrite anything.
 
     Raises:
         StoreExistsError: the path exists.
+        RegistryError: it is an address.
     """
-    if path.exists():
+    if new_path(path).exists():
         raise StoreExistsError(
             "the path to be written exists",
             expected="a new path",
@@ -369,6 +374,33 @@ def _pieces(name: str, source: Path | ZipObjects) -> Iterator[bytes]:
     with source.open("rb") as reader:
         while piece := reader.read(_PIECE_BYTES):
             yield piece
+
+
+def read_plain(path: Path, limit: int) -> bytes:
+    """Return the bytes of a file that a stranger may have put there.
+
+    Raises:
+        FormatError: it is a link, no plain file, has more bytes than the limit, or cannot be read.
+    """
+    try:
+        # A pipe in the place of a file would be waited for.
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            status = os.fstat(handle)
+            if stat.S_ISREG(status.st_mode) and status.st_size <= limit:
+                return _read_range(handle, 0, status.st_size, 0, limit)
+        finally:
+            os.close(handle)
+        got: object = "another kind of file, or a larger one"
+    except OSError as error:
+        got = "a link" if path.is_symlink() else error
+    raise FormatError(
+        "refused to read a file",
+        expected=f"a plain file of at most {limit} bytes, and no link: that could lead anywhere",
+        got=got,
+        where=path,
+        do="if it is yours, put the file itself in its place",
+    )
 
 
 def replace_file(path: Path, content: bytes, *, durable: bool = True) -> None:

@@ -19,7 +19,7 @@ from weighttraj.format.live import LiveStore
 from weighttraj.format.objects import ZipObjects, sync, write_zip
 from weighttraj.format.schema import AXES, Profile, RunInfo, arrays_of
 from weighttraj.format.storage import PACKED, RunStore, group_document
-from weighttraj.remote.address import Place, RemotePath, here
+from weighttraj.remote.address import Place, RemotePath, here, new_path
 
 GROUPS = frozenset({"critic", "optimizer", "probe", "train", "ret_norm", "eval"})
 """Arrays of a run that it can be without."""
@@ -59,7 +59,7 @@ def pack(path: str | Path, *, profile: Profile = "default", out: str | Path | No
             where=path,
             do="pip install --upgrade weighttraj, so that nothing is lost",
         )
-    target = Path(out or str(Path(path)).removesuffix(PACKED) + PACKED)
+    target = new_path(out or str(Path(path)).removesuffix(PACKED) + PACKED)
     _write(source, replace(source.info, profile=profile), slice(0, source.info.n_committed), target)
     return target
 

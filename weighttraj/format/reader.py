@@ -534,13 +534,13 @@ def open_dataset(
         RegistryError: it has no run of such an id, or the address is none.
         RemoteError: it is somewhere else, and cannot be reached.
     """
-    if isinstance(path, RemotePath) or is_remote(path):
+    if is_remote(path):
         place = path if isinstance(path, RemotePath) else RemotePath.parse(str(path), revision)
         if place.name.removesuffix(PACKED).endswith(".zarr"):
             return _chosen(_alone(open_run(place)), runs)
         return _chosen(_open_remote(place), runs)
     if revision is not None:
-        RemotePath.parse(f"file://{path}", revision)  # raises: no revisions here
+        RemotePath.parse(Path(path).absolute().as_uri(), revision)  # raises: no revisions here
     path = locate(path)
     if path.suffix == ".h5":
         from weighttraj.format.hdf5 import open_hdf5
@@ -638,7 +638,7 @@ def open_run(path: str | Place) -> Run:
         RemoteError: it is somewhere else, and cannot be reached.
     """
     place: Place
-    if isinstance(path, RemotePath) or is_remote(path):
+    if is_remote(path):
         place = path if isinstance(path, RemotePath) else RemotePath.parse(str(path)).as_object()
     else:
         place = Path(path)

@@ -9,12 +9,14 @@ from typing import Any
 from weighttraj.errors import DamageError
 from weighttraj.format.objects import ZipObjects, check_name, replaced
 from weighttraj.remote.address import RemotePath
-from weighttraj.remote.store import NoPartsError, Piece, store_at
+from weighttraj.remote.store import MAX_OBJECT, NoPartsError, Piece, store_at
 
 TAIL_BYTES = 1 << 16
 """Bytes at the end of a packed run that are fetched first: the directory of 800 objects."""
 GAP_BYTES = 1 << 14
 """Bytes between two objects that are fetched with them, rather than to ask twice."""
+PART_BYTES = 1 << 20
+"""Bytes at the start of an object up to which only they are asked for."""
 KEPT_BYTES = 64 << 20
 """Bytes of a run that are kept in memory, and fetched at a time, at most."""
 
@@ -66,6 +68,8 @@ class RemoteBlob:
         missing = [span for span in spans if self._find(*span) is None]
         while missing:
             start, stop = missing.pop(0)
+            if stop - start > KEPT_BYTES // 2:
+                return  # asked for when it is read, as far as it is read
             while missing and 0 <= missing[0][0] - stop <= GAP_BYTES:
                 if missing[0][1] - start > KEPT_BYTES // 2:
                     return  # asked for when it is read
@@ -111,12 +115,16 @@ class RemoteFolder:
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> bytes | None:
         """See ``Objects``."""
-        store, part = store_at(self.path.root), self._name(name)
-        if stop is not None and 0 <= start < stop:
+        store, limit = store_at(self.path.root), MAX_OBJECT if stop is None else stop
+        if stop is not None and (start > 0 or stop <= PART_BYTES):
             with contextlib.suppress(NoPartsError):
-                piece = store.read_range(part, start, stop)
+                piece = store.read_range(self._name(name), start, stop)
                 return None if piece is None else piece.content
-        piece = store.read(part)
+            limit = MAX_OBJECT
+        if name.endswith("zarr.json"):
+            piece = store.read(self._name(name), limit)
+        else:
+            piece = store.read_large(self._name(name), limit)
         return None if piece is None else piece.content[start:stop]
 
     def size(self, name: str) -> int | None:

@@ -32,6 +32,9 @@ TAGS = "weighttraj_crc32c"
 CHECKSUM = "weighttraj_sha256"
 """Key of the checksum of the group's metadata."""
 
+MAX_METADATA = 256 << 20
+"""Bytes of a run's metadata, at most: the checksums of 30 million chunks."""
+
 PACKED = ".zip"
 """Ending of a run that lies in one file."""
 
@@ -174,7 +177,15 @@ def read_metadata(objects: Objects) -> Metadata:
         DamageError: it does not match its checksum.
     """
     where = f"{objects.path}, zarr.json"
-    document = load_json(objects.read("zarr.json") or b"", where)
+    content = objects.read("zarr.json", 0, MAX_METADATA + 1) or b""
+    if len(content) > MAX_METADATA:
+        raise FormatError(
+            "refused: the metadata of a run are larger than any reader should take",
+            expected=f"at most {MAX_METADATA} bytes",
+            where=where,
+            do="do not use data from a source that you do not trust",
+        )
+    document = load_json(content, where)
     attributes = document.get("attributes") if isinstance(document, dict) else None
     if not isinstance(attributes, dict) or ATTRIBUTE not in attributes:
         raise FormatError(

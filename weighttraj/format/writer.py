@@ -28,6 +28,7 @@ from weighttraj.format.schema import (
     with_progress,
 )
 from weighttraj.format.values import as_array
+from weighttraj.remote.address import new_path
 
 Moments = tuple[np.ndarray, np.ndarray, float]
 """Statistics of a normaliser: mean, variance, count."""
@@ -58,7 +59,7 @@ class RunWriter:
     """
 
     def __init__(self, path: str | Path, info: RunInfo, *, resume: bool = False) -> None:
-        path = Path(path)
+        path = new_path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lock = lock_run(path)
         try:

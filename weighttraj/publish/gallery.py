@@ -8,20 +8,21 @@ from elsewhere.
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import re
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote, unquote
 
 import jinja2
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from rich.console import Console
 
-from weighttraj.errors import WeightTrajError
-from weighttraj.format.objects import replace_file
+from weighttraj.errors import FormatError, WeightTrajError
+from weighttraj.format.objects import MAX_NAME, read_plain, replace_file
 from weighttraj.publish import figures
 from weighttraj.publish.curves import KINDS, curves
 from weighttraj.publish.report import MARK, refuse_foreign, report
@@ -30,8 +31,13 @@ from weighttraj.publish.svg import Picture
 
 CARD = "README.md"
 INDEX = "index.html"
+PICTURES = (".png", ".jpg", ".jpeg", ".gif", ".webp", ".svg")
+"""What a picture beside a card may be."""
+MAX_CARD = 1 << 18
+"""Bytes of a card, at most."""
+MAX_PICTURE = 16 << 20
+"""Bytes of a picture beside it, at most."""
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _FRONT = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
 _SHOWN = ("environment", "algorithm", "runs", "snapshots", "parameters", "size on disk")
 
@@ -82,28 +88,46 @@ def gallery(
     """
     out, console = Path(out), console or Console(quiet=True)
     refuse_foreign(out / INDEX, overwrite=False)
-    (out / "cards").mkdir(parents=True, exist_ok=True)
-    found = []
+    found, models = [], []
     for name, path in datasets.items():
-        console.print(name)
-        try:
+        console.print(name, markup=False)
+        with _left_out(console):
             found.append(_dataset(name, path, out, film, console))
-        except WeightTrajError as error:
-            console.print(f"  left out: {error}")
-    models = [_model(card, out) for card in cards]
+    for card in cards:
+        with _left_out(console):
+            models.append(_model(card, out))
     page = _environment().get_template("gallery.html.j2")
     text = page.render(mark=MARK, datasets=found, models=models, script=SCRIPT, hash=_hash(SCRIPT))
     replace_file(out / INDEX, text.encode())
     return out / INDEX
 
 
+@contextlib.contextmanager
+def _left_out(console: Console) -> Iterator[None]:
+    """Say what is wrong with one entry, and go on without it."""
+    try:
+        yield
+    except WeightTrajError as error:
+        console.print(f"  left out: {error}", markup=False)
+
+
+def page_name(name: str) -> str:
+    """Return the name of a page without its ending; no two ids, or names of cards, share one."""
+    page = quote(name, safe="/", errors="surrogateescape").replace("~", "%7E").replace("/", "~")
+    if len(page) <= MAX_NAME:
+        return page
+    return f"{page[:100]}~~{hashlib.sha256(page.encode()).hexdigest()[:32]}"
+
+
 def _dataset(name: str, path: Path, out: Path, film: bool, console: Console) -> Entry:
-    source, place = open_source(path), name.replace("/", "__")
+    source, place = open_source(path), page_name(name)
+    card = path / CARD
+    text = _card_text(card) if card.is_symlink() or card.exists() else None
     page = f"data/{place}.html"
     report(path, out / page, film=film, console=console)
-    links = [("returns, steps, path", page)]
-    if (path / CARD).is_file():
-        links.append(("card", _write_card(path / CARD, out, place)))
+    links = [("returns, steps, path", quote(page))]
+    if text is not None:
+        links.append(("card", _write_card(text, card, out, f"cards/{place}")))
     said = [(label, value) for label, value in facts(source) if label in _SHOWN]
     return Entry(id=name, lead=lead(source), facts=said, links=links, figure=_curves(source))
 
@@ -118,55 +142,110 @@ def _curves(source: Source) -> Picture | None:
 
 
 def _model(card: Path, out: Path) -> Entry:
-    text = card.read_text()
+    text = _card_text(card)
     front = _FRONT.match(text)
     about = re.findall(r"^datasets:\n((?:- .*\n?)+)", front[1] if front else "", re.MULTILINE)
     learnt = ", ".join(line[2:] for block in about for line in block.splitlines())
-    body = _COMMENT.sub("", _FRONT.sub("", text))
-    paragraphs = [p.strip() for p in re.split(r"\n\s*\n", body)]
+    paragraphs = [p.strip() for p in re.split(r"\n\s*\n", _body(text))]
     paragraphs = [p for p in paragraphs if p and not p.startswith("#")]
-    first = re.sub(r"\[([^\]]*)\]\([^)]*\)|[*`]", r"\1", " ".join(paragraphs[:1])).strip()
+    start = " ".join(paragraphs[:1])[:2000]
+    first = re.sub(r"\[([^\]]*)\]\([^)]*\)|[*`]", r"\1", start).strip()
     said = [("data", learnt)] if learnt else []
-    return Entry(
-        id=card.stem,
-        lead=" ".join(first.split()),
-        facts=said,
-        links=[("card", _write_card(card, out, card.stem))],
-    )
+    page = _write_card(text, card, out, f"models/{page_name(card.stem)}")
+    return Entry(id=card.stem, lead=" ".join(first.split()), facts=said, links=[("card", page)])
 
 
-def _write_card(card: Path, out: Path, name: str) -> str:
-    """Write the page of a card, with the pictures that lie beside it; returns its address."""
-    html, pictures = as_html(card.read_text())
-    for picture in pictures:
-        source = card.parent / picture
-        if source.is_file() and source.resolve().parent == card.parent.resolve():
-            shutil.copyfile(source, out / "cards" / source.name)
-    text = _environment().get_template("card.html.j2").render(mark=MARK, name=name, body=html)
-    refuse_foreign(out / "cards" / f"{name}.html", overwrite=False)
-    replace_file(out / "cards" / f"{name}.html", text.encode())
-    return f"cards/{name}.html"
+def _card_text(card: Path) -> str:
+    """Return the text of a card.
+
+    Raises:
+        FormatError: it is a link, no file, too large, or no text.
+    """
+    try:
+        return read_plain(card, MAX_CARD).decode()
+    except UnicodeDecodeError as error:
+        raise FormatError(
+            "the card is no text in UTF-8", got=error, where=card, do="save it as UTF-8"
+        ) from error
 
 
-def as_html(text: str) -> tuple[str, list[str]]:
-    """Markdown of a card as HTML, and the pictures that it shows.
+def _write_card(text: str, card: Path, out: Path, page: str) -> str:
+    """Write the page of a card, with the pictures that lie beside it; return its address.
 
-    Raw HTML stays text; links within a repository, which lead nowhere from here, become text.
+    Pictures lie in a folder of the page's own: two cards may have pictures of one name.
+    """
+    html, pictures = as_html(text, lambda src: _shown_as(card, src, page))
+    target = out / f"{page}.html"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    refuse_foreign(target, overwrite=False)
+    for name in pictures:
+        file = out / page / name
+        file.parent.mkdir(exist_ok=True)
+        replace_file(file, read_plain(card.with_name(name), MAX_PICTURE))
+    rendered = _environment().get_template("card.html.j2")
+    body = rendered.render(mark=MARK, name=page.partition("/")[2], body=html)
+    replace_file(target, body.encode())
+    return quote(f"{page}.html")
+
+
+def _shown_as(card: Path, src: str, page: str) -> tuple[str, str] | None:
+    """Name and new address of a picture that lies beside a card; None: it is not shown."""
+    name = unquote(src)
+    if "/" in name or "\\" in name or not name.lower().endswith(PICTURES):
+        return None
+    try:
+        read_plain(card.with_name(name), MAX_PICTURE)
+    except (FormatError, ValueError):
+        return None
+    return name, quote(f"{page.rpartition('/')[2]}/{name}")
+
+
+def _body(text: str) -> str:
+    """A card without front matter and comments."""
+    kept, at, text = [], 0, _FRONT.sub("", text)
+    while (start := text.find("<!--", at)) >= 0 and (end := text.find("-->", start)) >= 0:
+        kept.append(text[at:start])
+        at = end + 3
+    return "".join([*kept, text[at:]])
+
+
+def as_html(
+    text: str, shown_as: Callable[[str], tuple[str, str] | None] = lambda src: (src, src)
+) -> tuple[str, list[str]]:
+    """Render the Markdown of a card, and name the pictures that it shows.
+
+    Raw HTML stays text; links within a repository, which lead nowhere from here, become text, and
+    so do pictures that are not shown.
+
+    Args:
+        text: of the card.
+        shown_as: returns name and address of a picture for its address in the card; None: it is
+            not shown.
     """
     parser = MarkdownIt("commonmark", {"html": False}).enable("table")
-    tokens = parser.parse(_COMMENT.sub("", _FRONT.sub("", text)))
+    tokens = parser.parse(_body(text))
     pictures: list[str] = []
     for token in tokens:
-        token.children = _outward(token.children or [], pictures) if token.children else None
+        if token.children:
+            token.children = _outward(token.children, pictures, shown_as)
     return str(parser.renderer.render(tokens, parser.options, {})), pictures
 
 
-def _outward(tokens: list[Token], pictures: list[str]) -> list[Token]:
+def _outward(
+    tokens: list[Token],
+    pictures: list[str],
+    shown_as: Callable[[str], tuple[str, str] | None],
+) -> list[Token]:
     """Tokens without the links that lead nowhere; names of the pictures are noted."""
     kept, dropped = [], 0
     for token in tokens:
         if token.type == "image":
-            pictures.append(str(token.attrs["src"]))
+            found = shown_as(str(token.attrs["src"]))
+            if found is None:
+                kept.append(Token("text", "", 0, content=token.content))
+                continue
+            pictures.append(found[0])
+            token.attrs["src"] = found[1]
         target = str(token.attrs.get("href", "")) if token.type == "link_open" else ""
         if token.type == "link_open" and not target.startswith(("https://", "http://", "#")):
             dropped += 1
@@ -213,4 +292,4 @@ search();
 """
 
 
-__all__ = ["INDEX", "Entry", "as_html", "gallery"]
+__all__ = ["INDEX", "Entry", "as_html", "gallery", "page_name"]

@@ -19,15 +19,16 @@ import numpy as np
 
 from weighttraj.errors import RegistryError
 from weighttraj.format import Algorithm, Dataset, open_dataset
-from weighttraj.format.catalog import MANIFEST, write_manifest
+from weighttraj.format.catalog import MANIFEST, check_file_names, write_manifest
 from weighttraj.format.locate import locate
-from weighttraj.format.objects import replace_file
+from weighttraj.format.objects import read_plain, replace_file
 from weighttraj.format.tables import RUNS, SNAPSHOTS
 from weighttraj.registry.croissant import CROISSANT, citation, croissant
 
 CARD = "README.md"
 START, END = "<!-- facts, {}: rewrite with `weighttraj card` -->", "<!-- end of facts -->"
 
+_MAX_CARD = 16 << 20  # bytes
 _PLACE = re.compile(
     r"<!-- facts, (?P<section>\w+): rewrite with `weighttraj card` -->\n.*?<!-- end of facts -->",
     re.DOTALL,
@@ -59,13 +60,26 @@ def write_card(path: str | Path) -> Path:
             do="finish collecting it",
         )
     card = folder / CARD
-    text = card.read_text() if card.is_file() else new_card(dataset)
+    check_file_names(folder)  # before anything changes
+    text = _card_there(card) or new_card(dataset)
     written = {CARD: refreshed(text, dataset), CROISSANT: croissant(dataset)}
     (folder / MANIFEST).unlink(missing_ok=True)  # from here on it would be wrong
     for name, content in written.items():
         replace_file(folder / name, content.encode())
     write_manifest(folder)
     return card
+
+
+def _card_there(card: Path) -> str | None:
+    """The text of a card; None: there is none."""
+    if not card.exists() and not card.is_symlink():
+        return None
+    try:
+        return read_plain(card, _MAX_CARD).decode()
+    except UnicodeDecodeError as error:
+        raise RegistryError(
+            "the card is no text in UTF-8", got=error, where=card, do="save it as UTF-8"
+        ) from error
 
 
 def refreshed(text: str, dataset: Dataset) -> str:

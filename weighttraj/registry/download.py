@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -26,6 +27,7 @@ from rich.progress import (
 from weighttraj.errors import DamageError, FormatError, RegistryError, RemoteError, StoreLockedError
 from weighttraj.format import Dataset, RunEntry, open_dataset, seal
 from weighttraj.format.catalog import (
+    DATASET,
     MANIFEST,
     ManifestLine,
     parse_manifest,
@@ -44,6 +46,7 @@ REQUEST = ".request.json"
 """File in a download that is not whole yet: which part of the runs it is of."""
 SOURCE = ".source.json"
 """File in a downloaded data set that says where it is from; no object of the data set."""
+_ODD = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 TRIES = 5
 """Times that a file is gone on with after an answer broke off without a byte."""
 
@@ -109,6 +112,7 @@ def download(
     manifest = store.read((at / MANIFEST).part)
     lines = parse_manifest(None if manifest is None else manifest.content, at)
     content = manifest.content if manifest else b""
+    _check_listed(_entries(dataset), lines, at)
     target = Path(out) if out is not None else home() / name_of(place)
     part = runs is not None or steps is not None or arrays is not None
     here = target / MANIFEST
@@ -128,18 +132,26 @@ def download(
             _list_part(dataset, draft, steps, arrays)
         else:
             replace_file(draft / MANIFEST, content)
+        open_dataset(draft)  # raises where it would not open; then it does not get its name
         source = Source(at.repository, revision, at.commit)
         replace_file(draft / SOURCE, json.dumps(asdict(source)).encode())
         draft.rename(target)
     return open_dataset(target)
 
 
-def download_folder(place: RemotePath, target: Path, console: Console | None = None) -> None:
+def download_folder(
+    place: RemotePath,
+    target: Path,
+    *,
+    needed: Collection[str] = (),
+    console: Console | None = None,
+) -> None:
     """Download the files that a manifest at an address lists, and check them.
 
     Args:
         place: where ``upload_folder`` wrote them.
         target: folder to be made.
+        needed: files that the manifest must list.
         console: where progress is shown; None: nowhere.
 
     Raises:
@@ -149,10 +161,11 @@ def download_folder(place: RemotePath, target: Path, console: Console | None = N
         RemoteError: it cannot be reached; what came is kept.
     """
     store = store_at(place.root)
-    manifest = store.read(MANIFEST)
+    manifest = store.read((place / MANIFEST).part)
     if manifest is None:
         raise FileNotFoundError(f"nothing is published at {place}: it has no {MANIFEST}")
     lines = parse_manifest(manifest.content, place)
+    _require(set(needed) - {line.path for line in lines}, place)
     draft = target.with_name(f".{target.name}.download")
     with _kept(draft):
         _fetch_all(store, place, lines, draft, console or Console(quiet=True))
@@ -166,9 +179,21 @@ def home() -> Path:
 
 
 def name_of(place: RemotePath) -> str:
-    """What a data set is called here: ``org/name`` on the hub, else the address's last part."""
-    repository = place.repository
-    return repository.removeprefix("hf://") if place.scheme == "hf" else place.name
+    """Return what a data set is called here: ``org/name`` on the hub, else the last part.
+
+    Raises:
+        RegistryError: no folder can have this name.
+    """
+    name = place.root.host if place.scheme == "hf" and not place.part else place.name
+    if len(name) > 200 or name in ("", "..") or name[0] == "." or _ODD.search(name):
+        raise RegistryError(
+            "the last part of the address is no name for a folder here",
+            expected="up to 200 characters without control characters, not beginning with a dot",
+            got=repr(name),
+            where=place,
+            do="name the folder: --out, or out=",
+        )
+    return name
 
 
 def source_of(path: Path) -> Source | None:
@@ -183,6 +208,27 @@ def _entries(dataset: Dataset) -> list[RunEntry]:
     """The lines of the list of runs that are those of the runs opened."""
     ids = {run.id for run in dataset}
     return [entry for entry in dataset.info.runs if entry.id in ids]
+
+
+def _check_listed(
+    entries: Collection[RunEntry], lines: list[ManifestLine], place: RemotePath
+) -> None:
+    """Refuse a manifest that leaves out what the list of runs names, before anything is fetched."""
+    listed = {line.path for line in lines}
+    folders = {path.removesuffix("/zarr.json") for path in listed if path.endswith("/zarr.json")}
+    there = listed | folders | {path.removesuffix(PACKED) for path in listed}
+    _require({DATASET, *(entry.path for entry in entries)} - there, place)
+
+
+def _require(missing: Collection[str], place: RemotePath) -> None:
+    if missing:
+        raise DamageError(
+            "the manifest leaves out files that have to be there",
+            expected=f"lines of {', '.join(sorted(missing)[:5])}",
+            got=f"{len(missing)} of them are missing",
+            where=place / MANIFEST,
+            do="tell those who published it; nothing was downloaded",
+        )
 
 
 def _fetch_all(
@@ -231,7 +277,7 @@ def _fetch(
         "a file at the address is not what the manifest says",
         expected=f"{line.size} bytes, sha256 {line.sha256}",
         got=f"sha256 {digest}",
-        where=RemotePath(store.root, name),
+        where=store.root.text(name),
         do="tell those who published it; nothing of this file was kept",
     )
 
@@ -260,7 +306,7 @@ def _append(
             except FileNotFoundError as error:
                 raise DamageError(
                     "a file that the manifest lists is not at the address",
-                    where=RemotePath(store.root, name),
+                    where=store.root.text(name),
                     do="tell those who published it",
                 ) from error
             except BrokenOffError:
@@ -355,8 +401,14 @@ def _list_part(
 def _kept(draft: Path) -> Iterator[None]:
     """A folder that one process works in, and that stays if it does not come to its end."""
     try:
+        lock_file = draft.with_name(f"{draft.name}.lock")
+        for path in (draft, lock_file):
+            _refuse_link(path)
         draft.mkdir(parents=True, exist_ok=True)
-        with FileLock(draft.with_name(f"{draft.name}.lock"), timeout=0) as lock:
+        with FileLock(lock_file, timeout=0) as lock:
+            for path in draft.rglob("*"):
+                if path.is_symlink():  # none is ours, and it could lead anywhere
+                    path.unlink()
             yield
         Path(lock.lock_file).unlink(missing_ok=True)
     except Timeout as error:
@@ -372,8 +424,19 @@ def _kept(draft: Path) -> Iterator[None]:
             "the data set could not be written; what came is kept",
             got=error,
             where=draft,
-            do="make room, and give the command again: it goes on",
+            do="make room, or correct the permissions, and give the command again: it goes on",
         ) from error
+
+
+def _refuse_link(path: Path) -> None:
+    if path.is_symlink():
+        raise FormatError(
+            "a link lies where the download keeps what came",
+            expected="nothing, or a folder of an earlier download",
+            got=f"a link to {path.readlink()}",
+            where=path,
+            do="remove the link, or choose another folder with --out",
+        )
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from weighttraj.format import Dataset, open_dataset
 from weighttraj.format.locate import locate
 from weighttraj.registry.download import download as fetch
 from weighttraj.registry.download import home, name_of, source_of
-from weighttraj.remote.address import RemotePath, is_remote
+from weighttraj.remote.address import RemotePath, below, is_remote
 
 REMOTE = "WEIGHTTRAJ_REMOTE"
 """Environment variable: address below which data sets are looked for that are named by an id."""
@@ -56,7 +56,7 @@ def load_dataset(
                     f"no data set {name!r} here; set {REMOTE} to the address that has it, or name "
                     "its address: hf://organisation/name"
                 ) from None
-            name = f"{base.rstrip('/')}/{name}"
+            name = below(base, name)
         else:
             return open_dataset(name, runs=runs, revision=revision)
     place = RemotePath.parse(name, revision)
@@ -76,7 +76,7 @@ def _downloaded(place: RemotePath, revision: str | None, runs: Collection[str] |
     """
     path = home() / name_of(place)
     source = source_of(path)
-    if source is None or source.repository != RemotePath.parse(str(place)).repository:
+    if source is None or source.repository != place.repository:
         raise FileNotFoundError(path)
     if revision is not None and revision not in (source.revision, source.commit):
         raise RegistryError(

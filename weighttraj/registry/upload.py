@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -14,11 +15,12 @@ from weighttraj.errors import RegistryError
 from weighttraj.format import Dataset, lint, open_dataset, verify
 from weighttraj.format.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
 from weighttraj.format.locate import is_run, locate
+from weighttraj.format.objects import read_plain
 from weighttraj.progress import LoggedProgress
 from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.hub import client, hub_error, pinned
-from weighttraj.remote.store import RemoteStore, store_at
+from weighttraj.remote.store import MAX_DOCUMENT, RemoteStore, store_at
 
 CLAIM = "UPLOADING.sha256"
 """Object that holds the manifest of what is being uploaded, for as long as it is."""
@@ -102,7 +104,8 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             where=folder,
             do=f"weighttraj card {folder}",
         )
-    if "\n## Citation\n" not in (folder / CARD).read_text():
+    text = read_plain(folder / CARD, MAX_DOCUMENT).decode(errors="replace")
+    if re.search(r"^## Citation\s*$", text, re.MULTILINE) is None:
         raise RegistryError(
             "the card does not say how the data set is to be cited",
             expected=f"a section '## Citation' in {CARD}",
@@ -110,6 +113,7 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             where=folder,
             do="write one, or let `weighttraj card` make the card",
         )
+    _check_documents(folder)
     if problems := verify(folder):
         raise RegistryError(
             "the data set is damaged",
@@ -123,6 +127,20 @@ def _check(dataset: Dataset, folder: Path, despite_lint: bool) -> None:
             got="\n    ".join(findings[:5]),
             where=folder,
             do="correct it; if it is meant so, say so in the card and give --despite-lint",
+        )
+
+
+def _check_documents(folder: Path) -> None:
+    """Refuse what no reader would take: what is published can be read."""
+    files = [folder / name for name in (DATASET, MANIFEST)]
+    sizes = {file.name: file.stat().st_size for file in files if file.is_file()}
+    if too_large := {name: size for name, size in sizes.items() if size > MAX_DOCUMENT}:
+        raise RegistryError(
+            "a list of the data set is larger than readers take from an address",
+            expected=f"at most {MAX_DOCUMENT} bytes",
+            got=", ".join(f"{name}: {size}" for name, size in too_large.items()),
+            where=folder,
+            do="pack its runs (weighttraj pack), or publish it as several data sets",
         )
 
 
@@ -144,7 +162,7 @@ def upload_folder(
         RemoteError: the address cannot be reached.
     """
     if place.scheme == "file":
-        Path(place.root.removeprefix("file://")).mkdir(parents=True, exist_ok=True)
+        _make_folder(Path(place.root.path))
     store, manifest = store_at(place.root), (folder / MANIFEST).read_bytes()
     claimed = store.write(CLAIM, manifest, new=True)
     if not claimed and (there := store.read(CLAIM)) is not None and there.content != manifest:
@@ -194,7 +212,7 @@ def _send_all(
 
 
 def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: bool) -> RemotePath:
-    hub, repo = client(), place.repository.removeprefix("hf://")
+    hub, repo = client(), repository_of(place)
     api, kind, tag = hub.HfApi(), "dataset", f"v{dataset.info.version}"
 
     def asked(do: Callable[[], Any]) -> Any:
@@ -204,12 +222,12 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
             raise hub_error(error, str(place)) from error
 
     asked(lambda: api.create_repo(repo, repo_type=kind, private=private, exist_ok=True))
-    before = pinned(RemotePath.parse(place.repository))
+    before = pinned(place)
     there = store_at(before.root).read(MANIFEST)
     tags = [t.name for t in asked(lambda: api.list_repo_refs(repo, repo_type=kind)).tags]
     if there is None or there.content != (folder / MANIFEST).read_bytes():
         if tag in tags:
-            raise _immutable(RemotePath.parse(place.repository, tag))
+            raise _immutable(place.at(tag))
         # One commit: the client's upload_folder makes several of many files, and readers see them.
         lines = [line.path for line in read_manifest(folder)]
         names = {*lines, MANIFEST}
@@ -225,10 +243,38 @@ def _upload_to_hub(dataset: Dataset, folder: Path, place: RemotePath, private: b
                 parent_commit=before.commit,  # refused if another publisher was quicker
             )
         )
-    now = pinned(RemotePath.parse(place.repository))
+    now = pinned(place)
     if tag not in tags:
         asked(lambda: api.create_tag(repo, tag=tag, revision=now.commit, repo_type=kind))
     return now
+
+
+def repository_of(place: RemotePath) -> str:
+    """Return the repository of the hub that something is published in, ``organisation/name``.
+
+    Raises:
+        RegistryError: the address names a revision, or a folder in the repository.
+    """
+    if place.part or place.root.revision != "main":
+        raise RegistryError(
+            "on the hub one repository holds one data set or model, and main its latest version",
+            expected=f"hf://{place.root.host}",
+            got=place,
+            do="leave the rest of the address out; versions become tags",
+        )
+    return place.root.host
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RegistryError(
+            "the folder of this address cannot be made",
+            got=error,
+            where=path,
+            do="correct the address or the permissions",
+        ) from error
 
 
 def _immutable(place: RemotePath) -> RegistryError:
@@ -241,4 +287,4 @@ def _immutable(place: RemotePath) -> RegistryError:
     )
 
 
-__all__ = ["CLAIM", "upload", "upload_folder"]
+__all__ = ["CLAIM", "repository_of", "upload", "upload_folder"]

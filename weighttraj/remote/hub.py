@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from typing import Any
+from urllib.parse import quote
 
 from weighttraj.errors import RemoteError, missing_extra
-from weighttraj.remote.address import RemotePath
+from weighttraj.remote.address import RemotePath, Root
+from weighttraj.remote.wait import within
 
 
 def client() -> Any:
-    """``huggingface_hub``.
+    """Return the module ``huggingface_hub``.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -24,54 +26,58 @@ def client() -> Any:
 
 
 def pinned(place: RemotePath) -> RemotePath:
-    """The same, at the commit that its revision is now: later commits change nothing for a reader.
+    """Return the place at the commit that its revision is now, so that later commits do not matter.
 
     Raises:
-        RemoteError: there is no such repository or revision, or the hub cannot be reached.
+        RemoteError: there is no such repository or revision, or the hub cannot be reached in time.
     """
     if place.commit is not None:
         return place
-    repo, revision = _parts(place.root)
-    hub = client()
+    hub, root = client(), place.root
+
+    def ask() -> Any:
+        return hub.HfApi().repo_info(root.host, revision=root.revision, repo_type="dataset").sha
+
     try:
-        commit = hub.HfApi().repo_info(repo, revision=revision, repo_type="dataset").sha
+        return place.at(within(ask, place))
+    except RemoteError:
+        raise
     except Exception as error:
-        raise hub_error(error, place.root) from error
-    return RemotePath(f"hf://{repo}@{commit}", place.part)
+        raise hub_error(error, place) from error
 
 
-def resolve_url(root: str) -> str:
-    """Where the files of a repository are, over HTTP."""
-    repo, revision = _parts(root)
-    return f"{client().constants.ENDPOINT}/datasets/{repo}/resolve/{revision}"
+def resolve_url(root: Root) -> str:
+    """Return the URL below which the files of a repository are."""
+    revision = quote(root.revision, safe="")
+    return f"{client().constants.ENDPOINT}/datasets/{root.host}/resolve/{revision}"
 
 
 def headers() -> dict[str, str]:
-    """Who we are, if we have said so."""
+    """Return the header that holds the user's token, if there is one."""
     token = client().get_token()
     return {"authorization": f"Bearer {token}"} if token else {}
 
 
-def hub_error(error: Exception, where: str) -> RemoteError:
-    """An error of the hub's client as ours, with its cause."""
+def hub_error(error: Exception, where: object) -> RemoteError:
+    """Return an error of the hub's client as one of this package."""
     hub = client()
-    do = "see whether the hub can be reached, and try again"
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    what, do = "the hub does not do what was asked", "see what it answers, and try again"
     if isinstance(error, hub.errors.OfflineModeIsEnabled):
         do = "unset HF_HUB_OFFLINE, or name a data set that was downloaded before"
     elif isinstance(error, hub.errors.RepositoryNotFoundError | hub.errors.RevisionNotFoundError):
         do = "correct the name; if it is private: hf auth login, or set HF_TOKEN"
+    elif status in (401, 403):
+        do = "hf auth login, or set HF_TOKEN to a token that may do this; ask for access if the "
+        do += "repository is gated"
+    elif status is None and not isinstance(error, ValueError):
+        what, do = "the hub cannot be reached", "check the network, HF_ENDPOINT and the proxy"
     return RemoteError(
-        "the hub does not do what was asked",
+        what,
         got=f"{type(error).__name__}: {' '.join(str(error).split())[:400]}",
         where=where,
         do=do,
     )
-
-
-def _parts(root: str) -> tuple[str, str]:
-    """Repository and revision of a root."""
-    repo, _, revision = root.removeprefix("hf://").partition("@")
-    return repo, revision
 
 
 __all__ = ["client", "headers", "hub_error", "pinned", "resolve_url"]
