@@ -93,6 +93,9 @@ def test_names_from_the_metadata_are_no_paths(tmp_path: Path) -> None:
         def read(self, name: str, key: object) -> np.ndarray:
             return honest.read("train/approx_kl" if name == odd else name, key)
 
+        def chunk_rows(self, name: str) -> int:
+            return honest.chunk_rows("train/approx_kl" if name == odd else name)
+
     folder = export_npy(wt.Run(honest.path, Hostile), tmp_path / "deep" / "er" / "npy")
     assert {p.name for p in tmp_path.iterdir()} == {"run.zarr", "run.zarr.lock", "deep"}
     with (folder / "snapshots.csv").open(newline="") as text:
