@@ -264,6 +264,27 @@ def test_comparing_moves_no_random_number(tmp_path: Path) -> None:
     assert torch.equal(*ends)
 
 
+def test_an_environment_with_a_handle_of_a_simulator_is_left_alone(tmp_path: Path) -> None:
+    ended: list[str] = []
+
+    class Handle:
+        def __del__(self) -> None:
+            ended.append("connection")
+
+    class Connected(Paying):
+        def __init__(self) -> None:
+            super().__init__()
+            self.nested = {"handle": [Handle()]}
+
+    gym.register("Connected-v0", Connected)
+    env = gym.make("Connected-v0")
+    info = record(lambda: env, tmp_path).info.env
+    del gym.registry["Connected-v0"]
+    assert info is not None
+    assert info.cannot_remake == ()
+    assert ended == []
+
+
 def test_an_infinite_clip_of_the_normaliser_is_stored_and_acts(tmp_path: Path) -> None:
     made: list[VecNormalize] = []
 

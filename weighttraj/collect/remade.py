@@ -10,13 +10,18 @@ from __future__ import annotations
 
 import copy
 import random
+import sys
+from collections import deque
 from collections.abc import Sequence
+from types import BuiltinFunctionType, FunctionType
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import torch
 from gymnasium import wrappers as gw
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import data_equivalence
 
 from weighttraj import environments
@@ -29,6 +34,13 @@ _STEPS = 16
 _SEED = 0
 _MOST = 2**26
 """Bytes of an environment's arrays beyond which it is not copied."""
+_SHARED = {"pybullet"}
+"""Simulators whose environments all live in one state."""
+_DATA = (
+    *(bool, int, float, complex, str, bytes, type, FunctionType, BuiltinFunctionType),
+    *(np.generic, np.random.Generator, np.random.RandomState, random.Random),
+    *(gym.Space, EnvSpec, mujoco.MjModel, mujoco.MjData),
+)
 _NEUTRAL = (gw.TimeLimit, gw.OrderEnforcing, gw.PassiveEnvChecker)
 _NORMALISING = (gw.NormalizeObservation, gw.TransformObservation, ClipObservation)
 
@@ -118,17 +130,43 @@ def _twin(env: Any) -> Any:
 
     Not ``deepcopy``: many environments copy themselves by being made again.
     """
+    values = vars(env)
+    if values.get("render_mode") == "human" or _SHARED & sys.modules.keys():
+        return None
+    if hasattr(type(env), "__del__") or not _is_data(values, set(), [_MOST]):
+        return None
     try:
-        values = vars(env)
-        if sum(getattr(value, "nbytes", 0) for value in values.values()) > _MOST:
-            return None
-        if values.get("render_mode") == "human":
-            return None
         twin = object.__new__(type(env))
         twin.__dict__.update(copy.deepcopy(values, {id(env): twin}))
-    except Exception:  # sockets, windows, threads
+    except Exception:  # the code of a stranger may raise anything
         return None
     return twin
+
+
+def _is_data(value: Any, seen: set[int], left: list[int]) -> bool:
+    """Return whether a value is data throughout, of which a copy shares nothing with the original.
+
+    Windows, sockets, and handles of simulators are not: what a copy does, they would feel.
+
+    Args:
+        value: anything.
+        seen: ids of the objects that were looked at.
+        left: how many bytes arrays may still have.
+    """
+    if id(value) in seen:
+        return True
+    seen.add(id(value))
+    if isinstance(value, np.ndarray | torch.Tensor):
+        left[0] -= value.nbytes
+        return left[0] >= 0 and value.dtype != object
+    if value is None or isinstance(value, _DATA):
+        return True
+    if isinstance(value, dict):
+        return all(_is_data(item, seen, left) for pair in value.items() for item in pair)
+    if isinstance(value, list | tuple | set | frozenset | deque):
+        return all(_is_data(item, seen, left) for item in value)
+    plain = type(value).__module__ != "builtins" and hasattr(value, "__dict__")
+    return plain and not hasattr(type(value), "__del__") and _is_data(vars(value), seen, left)
 
 
 def _wrappers(env: gym.Env[Any, Any]) -> list[gym.Wrapper[Any, Any, Any, Any]]:

@@ -139,8 +139,8 @@ class Evaluator:
         return EpisodeReturns(returns, lengths)
 
     def close(self) -> None:
-        """Close the environments."""
-        for simulator in self._simulators:
+        """Close the environments; those that were never made are not made for it."""
+        for simulator in self.__dict__.get("_simulators", ()):
             simulator.close()
         self._env.close()
 
