@@ -75,16 +75,24 @@ def test_a_module_that_does_not_help_is_an_error(name: str, message: str, folder
         sys.modules.pop(left, None)
 
 
-def test_every_command_that_makes_environments_takes_modules(folder: Path) -> None:
+def test_without_the_module_the_error_names_the_option(folder: Path) -> None:
     said = run("weighttraj", "collect", "recipe.toml", "--out", "theirs")
     assert said.returncode == 1
     assert "--import MODULE" in " ".join(said.stderr.split())
+
+
+def test_workers_import_the_module_too(folder: Path) -> None:
+    module = ("--workers", 2, "--import", "their_environments")
+    done = run("weighttraj", "collect", "recipe.toml", "--out", "theirs", *module)
+    assert done.returncode == 0, done.stderr
+    assert len(wt.open("theirs").runs[0]) == 3
+
+
+def test_commands_that_make_environments_take_the_module(folder: Path) -> None:
     module = ("--import", "their_environments")
     for command in (
-        ("collect", "recipe.toml", "--out", "theirs", "--workers", 2),
-        ("returns", "theirs", "--workers", 2, "--episodes", 1),
-        ("verify", "theirs", "--replay", 2),
-        ("report", "theirs"),
+        ("collect", "recipe.toml", "--out", "theirs"),
+        ("returns", "theirs", "--episodes", 1),
     ):
         done = run("weighttraj", *command, *module)
         assert done.returncode == 0, done.stderr
