@@ -10,6 +10,7 @@ import pytest
 
 import weighttraj as wt
 from tests.test_cli import run
+from weighttraj.engine import Tell, engine_of
 from weighttraj.errors import CollectError
 from weighttraj.plugins import import_modules
 
@@ -81,11 +82,15 @@ def test_without_the_module_the_error_names_the_option(folder: Path) -> None:
     assert "--import MODULE" in " ".join(said.stderr.split())
 
 
+def limit_of(env_id: str, _: Tell) -> int | None:
+    return gym.spec(env_id).max_episode_steps
+
+
 def test_workers_import_the_module_too(folder: Path) -> None:
-    module = ("--workers", 2, "--import", "their_environments")
-    done = run("weighttraj", "collect", "recipe.toml", "--out", "theirs", *module)
-    assert done.returncode == 0, done.stderr
-    assert len(wt.open("theirs").runs[0]) == 3
+    with engine_of(2, imports=["their_environments"]) as engine:
+        outcomes = list(engine.run(limit_of, ["Theirs-v0"] * 2, lambda: None))
+    assert outcomes == [("Theirs-v0", 20)] * 2
+    del gym.registry["Theirs-v0"], sys.modules["their_environments"]
 
 
 def test_commands_that_make_environments_take_the_module(folder: Path) -> None:

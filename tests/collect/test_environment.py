@@ -201,6 +201,7 @@ def test_what_the_registration_brings_it_brings_again(tmp_path: Path) -> None:
         (lambda: gym.wrappers.RescaleAction(gym.make("Paying-v0"), -2, 2), "RescaleAction"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:the weights of this training are recorded")  # RescaleAction
 def test_an_environment_that_is_not_what_its_id_makes_is_noticed(
     make: Make, reason: str, tmp_path: Path
 ) -> None:
