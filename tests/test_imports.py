@@ -16,10 +16,12 @@ ROOT = Path(__file__).parents[1]
 FORMAT = "weighttraj.format"
 REMOTE = "weighttraj.remote.address"
 ALLOWED = {
-    "weighttraj.errors": [],
+    "weighttraj.text": [],
+    "weighttraj.errors": ["weighttraj.text"],
+    "weighttraj.atomic": ["weighttraj.errors", REMOTE],
     "weighttraj.threads": [],
     "weighttraj.progress": [],
-    "weighttraj.terminal": [],
+    "weighttraj.terminal": ["weighttraj.text"],
     "weighttraj.plugins": ["weighttraj.errors"],
     "weighttraj.engine": ["weighttraj.errors", "weighttraj.engine"],
     "weighttraj.engine.choose": [
@@ -41,7 +43,11 @@ ALLOWED = {
         "weighttraj.format.exact",
         "weighttraj.format.layout",
     ],
-    "weighttraj.format.objects": ["weighttraj.errors", "weighttraj.remote.address"],
+    "weighttraj.format.objects": [
+        "weighttraj.atomic",
+        "weighttraj.errors",
+        "weighttraj.remote.address",
+    ],
     "weighttraj.format.remote": [
         "weighttraj.errors",
         "weighttraj.format.objects",
@@ -54,6 +60,7 @@ ALLOWED = {
         "weighttraj.format.objects",
     ],
     "weighttraj.format.encode": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         "weighttraj.format.codecs",
         "weighttraj.format.schema",
@@ -68,6 +75,7 @@ ALLOWED = {
         "later weighttraj.format.remote",
     ],
     "weighttraj.format.live": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         "weighttraj.format.codecs",
         "weighttraj.format.encode",
@@ -77,6 +85,7 @@ ALLOWED = {
         REMOTE,
     ],
     "weighttraj.format.packing": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         REMOTE,
         "weighttraj.format.live",
@@ -85,6 +94,7 @@ ALLOWED = {
         "weighttraj.format.storage",
     ],
     "weighttraj.format.writer": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         REMOTE,
         "weighttraj.format.live",
@@ -93,6 +103,7 @@ ALLOWED = {
         "weighttraj.format.values",
     ],
     "weighttraj.format.returns": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         "weighttraj.format.live",
         "weighttraj.format.objects",
@@ -103,12 +114,15 @@ ALLOWED = {
         REMOTE,
     ],
     "weighttraj.format.catalog": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         "weighttraj.format.objects",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
     ],
     "weighttraj.format.tables": [
+        "weighttraj.text",
+        "weighttraj.atomic",
         "weighttraj.errors",
         "weighttraj.format.objects",
         "weighttraj.format.reader",
@@ -116,6 +130,7 @@ ALLOWED = {
     "weighttraj.format.lint": ["weighttraj.format.reader", REMOTE],
     "weighttraj.format.locate": ["weighttraj.remote"],
     "weighttraj.format.reader": [
+        "weighttraj.text",
         "weighttraj.errors",
         "weighttraj.format.catalog",
         "weighttraj.format.codecs",
@@ -132,6 +147,7 @@ ALLOWED = {
         "later weighttraj.remote",
     ],
     "weighttraj.format.export": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         "weighttraj.format.objects",
         "weighttraj.format.reader",
@@ -144,12 +160,13 @@ ALLOWED = {
         "weighttraj.format.schema",
         "weighttraj.format.storage",
     ],
-    "weighttraj.format.hdf5": [FORMAT, "weighttraj.errors"],
-    "weighttraj.format.integrity": [FORMAT, "weighttraj.errors", REMOTE],
+    "weighttraj.format.hdf5": ["weighttraj.atomic", FORMAT, "weighttraj.errors"],
+    "weighttraj.format.integrity": ["weighttraj.atomic", FORMAT, "weighttraj.errors", REMOTE],
     "weighttraj.format": [FORMAT],
     "weighttraj.environments": ["weighttraj.errors", FORMAT],
     "weighttraj.collect": [
         "weighttraj.plugins",
+        "weighttraj.atomic",
         "weighttraj.progress",
         "weighttraj.threads",
         "weighttraj.engine",
@@ -164,6 +181,8 @@ ALLOWED = {
     ],
     "weighttraj.learning": [],
     "weighttraj.policies": [
+        "weighttraj.text",
+        "weighttraj.atomic",
         "weighttraj.learning",
         "weighttraj.progress",
         "weighttraj.threads",
@@ -183,8 +202,17 @@ ALLOWED = {
         "weighttraj.policies",
         "weighttraj.publish",
     ],
-    "weighttraj.publish": ["weighttraj.errors", FORMAT, REMOTE, "weighttraj.publish"],
+    "weighttraj.publish": [
+        "weighttraj.text",
+        "weighttraj.atomic",
+        "weighttraj.errors",
+        FORMAT,
+        REMOTE,
+        "weighttraj.publish",
+    ],
     "weighttraj.publish.report": [
+        "weighttraj.text",
+        "weighttraj.atomic",
         "weighttraj.progress",
         "weighttraj.errors",
         FORMAT,
@@ -192,6 +220,7 @@ ALLOWED = {
         "later weighttraj.publish.film",
     ],
     "weighttraj.load.cache": [
+        "weighttraj.atomic",
         "weighttraj.errors",
         "door weighttraj.format",
         "weighttraj.format.objects",
@@ -218,6 +247,7 @@ ALLOWED = {
         "weighttraj.registry.local",
     ],
     "weighttraj.registry.derive": [
+        "weighttraj.atomic",
         "weighttraj.progress",
         "weighttraj.errors",
         "door weighttraj.format",
@@ -227,11 +257,14 @@ ALLOWED = {
         "weighttraj.format.storage",
     ],
     "weighttraj.registry.croissant": [
+        "weighttraj.text",
         "weighttraj.errors",
         "door weighttraj.format",
         "weighttraj.format.tables",
     ],
     "weighttraj.registry.card": [
+        "weighttraj.text",
+        "weighttraj.atomic",
         "weighttraj.errors",
         "door weighttraj.format",
         "weighttraj.format.catalog",
@@ -242,6 +275,7 @@ ALLOWED = {
     ],
     "weighttraj.registry.transfer": ["weighttraj.format.catalog", "weighttraj.remote"],
     "weighttraj.registry.download": [
+        "weighttraj.atomic",
         "weighttraj.progress",
         "weighttraj.errors",
         "weighttraj.registry.transfer",
@@ -390,7 +424,7 @@ ALLOWED = {
         "door weighttraj",
     ],
     "tipl.distributed": ["tipl.errors"],
-    "tipl.state": ["tipl.errors"],
+    "tipl.state": ["weighttraj.atomic", "tipl.errors"],
     "tipl.progress": ["weighttraj.progress"],
     "tipl.threads": [],
     "tipl.step": ["tipl.distributed", "tipl.errors", "tipl.models", "tipl.tokens"],
@@ -409,6 +443,7 @@ ALLOWED = {
     ],
     "tipl.report": ["tipl.errors", "tipl.report"],
     "tipl.evaluation": [
+        "weighttraj.atomic",
         "tipl.settings",
         "tipl.threads",
         "weighttraj.progress",

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 import weighttraj as wt
 from weighttraj.errors import WeightTrajError
 from weighttraj.remote.address import here, new_path
-from weighttraj.terminal import Output, while_read
+from weighttraj.terminal import Output, say, while_read
 
 try:
     import tipl
@@ -43,7 +42,7 @@ except WeightTrajError as error:
 
 app = tyro.extras.SubcommandApp()
 console = Output()
-errors = Console(stderr=True)
+errors = Output(stderr=True)
 _WIDE = 150
 """Characters that a table with intervals needs."""
 
@@ -59,7 +58,7 @@ def _train(config: TrainConfig) -> None:
     signal.signal(signal.SIGTERM, _stop)
     tipl.train(config, console=console)
     if rank_here() == 0:
-        print(f"model in {config.out}")
+        say(f"model in {config.out}")
 
 
 @app.command(name="train-gate")
@@ -69,7 +68,7 @@ def _train_gate(config: GateTrainConfig) -> None:
     new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     train_gate(config, console=console)
-    print(f"model in {config.out}")
+    say(f"model in {config.out}")
 
 
 @app.command(name="train-drift")
@@ -79,7 +78,7 @@ def _train_drift(config: DriftConfig) -> None:
     new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     drift = train_drift(config, console=console)
-    print(f"model in {config.out}: {drift.amplitudes}")
+    say(f"model in {config.out}: {drift.amplitudes}")
 
 
 @app.command(name="train-causal")
@@ -89,7 +88,7 @@ def _train_causal(config: CausalTrainConfig) -> None:
     new_path(config.out)
     signal.signal(signal.SIGTERM, _stop)
     train_causal(config, console=console)
-    print(f"model in {config.out}")
+    say(f"model in {config.out}")
 
 
 @app.command(name="fit")
@@ -124,7 +123,7 @@ def _fit(
         "steps": steps,
     }
     tipl.save_ladder(ladder, out, settings)
-    print(f"{len(ladder)} baselines in {out}: {' '.join(f.name for f in ladder)}")
+    say(f"{len(ladder)} baselines in {out}: {' '.join(f.name for f in ladder)}")
 
 
 def _stop(*_: object) -> NoReturn:
@@ -157,8 +156,8 @@ def _evaluate(args: _Evaluate) -> None:
         forecasters, config, workers=args.workers, imports=args.imports, console=console
     )
     console.print(_table(results))
-    print(report.verdict(results))
-    print(f"report: {config.out / 'report.html'}")
+    say(report.verdict(results))
+    say(f"report: {config.out / 'report.html'}")
 
 
 @app.command(name="check")
@@ -191,7 +190,7 @@ def _check(
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(found, indent=1) + "\n")
     for name, passed in found["passed"].items():
-        print(f"{name}: {'passes' if passed else 'fails'}, {found[name]}")
+        say(f"{name}: {'passes' if passed else 'fails'}, {found[name]}")
 
 
 @app.command(name="zoo")
@@ -222,9 +221,9 @@ def _release(
 ) -> None:
     """Put a model into the zoo: once as a draft, and with its results after it was judged there."""
     out = release(here(folder), name, results=results, checks=checks, log=log)
-    print(f"model in {out}")
+    say(f"model in {out}")
     if read_metrics(out) is None:
-        print(f"a draft: judge it with `tipl evaluate {name} ...`, then give --results")
+        say(f"a draft: judge it with `tipl evaluate {name} ...`, then give --results")
 
 
 @app.command(name="card")
@@ -233,7 +232,7 @@ def _card(
     out: Annotated[Path, tyro.conf.arg(help="folder of the cards")] = Path("cards/models"),
 ) -> None:
     """Write the card of a model, or the figures of its metrics.json into the card that is there."""
-    print(f"card in {write_card(name, new_path(out))}")
+    say(f"card in {write_card(name, new_path(out))}")
 
 
 @app.command(name="push")
@@ -252,7 +251,7 @@ def _push(
     ] = None,
 ) -> None:
     """Publish a model with its card, on the Hugging Face hub or in an object store."""
-    print(f"published: {tipl.push(model, address, private=private, card=card)}")
+    say(f"published: {tipl.push(model, address, private=private, card=card)}")
 
 
 @app.command(name="report")
@@ -266,9 +265,9 @@ def _report(
     document = read_results(here(results))
     if into is not None:
         report.insert_markdown(document, results, into)
-        print(f"results in {into}")
+        say(f"results in {into}")
     else:
-        print(f"report: {report.write_report(document, results.parent)}")
+        say(f"report: {report.write_report(document, results.parent)}")
 
 
 def _table(results: dict[str, Any]) -> Table:

@@ -10,10 +10,11 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from tipl.errors import TrainError
+from weighttraj.atomic import replace_file
 
 
 def keep_settings(
@@ -34,7 +35,9 @@ def keep_settings(
     file, settings = out / "train.json", json.loads(json.dumps(settings))
     if file.exists():
         known = {k: getattr(type(config), k, None) for k in settings}
-        old = json.loads(json.dumps(known, default=str)) | json.loads(file.read_text())
+        old = json.loads(json.dumps(known, default=str)) | json.loads(
+            file.read_text(encoding="utf-8")
+        )
         other = {k: v for k, v in settings.items() if old[k] != v and k not in may_differ}
         if other:
             raise TrainError(
@@ -45,9 +48,7 @@ def keep_settings(
                 do="choose another --out, or delete the folder",
             )
     out.mkdir(parents=True, exist_ok=True)
-    draft = out / ".train.json.draft"
-    draft.write_text(json.dumps(settings, indent=1))
-    draft.replace(file)
+    replace_file(file, json.dumps(settings, indent=1).encode())
 
 
 def save_state(out: Path, model: nn.Module, optimizer: torch.optim.Optimizer, n: int) -> None:
@@ -56,9 +57,7 @@ def save_state(out: Path, model: nn.Module, optimizer: torch.optim.Optimizer, n:
     for i, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{i}.{name}": t for name, t in state.items()}
     tensors["n"] = torch.tensor(n)
-    draft = out / ".state.safetensors.draft"
-    save_file(tensors, draft)
-    draft.replace(out / "state.safetensors")
+    replace_file(out / "state.safetensors", save(tensors))
 
 
 def read_state(out: Path) -> dict[str, Tensor]:
@@ -100,7 +99,7 @@ def restore(tensors: dict[str, Tensor], model: nn.Module, optimizer: torch.optim
 
 def append_log(out: Path, line: dict[str, Any]) -> None:
     """One more line of log.jsonl."""
-    with (out / "log.jsonl").open("a") as file:
+    with (out / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 
@@ -109,15 +108,14 @@ def cut_log(out: Path, n: int) -> None:
     file = out / "log.jsonl"
     if not file.exists():
         return
-    draft = out / ".log.jsonl.draft"
-    draft.write_text("".join(f"{json.dumps(x)}\n" for x in read_log(out) if x["batch"] <= n))
-    draft.replace(file)
+    kept = [x for x in read_log(out) if x["batch"] <= n]
+    replace_file(file, "".join(f"{json.dumps(x)}\n" for x in kept).encode())
 
 
 def read_log(out: Path) -> list[dict[str, float]]:
     """The lines of log.jsonl; without one that a process was writing when it died."""
     file = out / "log.jsonl"
-    lines = file.read_text().splitlines() if file.exists() else []
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
     found = []
     for line in lines:
         with contextlib.suppress(ValueError):

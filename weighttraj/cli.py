@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm
 from rich.table import Table
@@ -21,14 +20,14 @@ from weighttraj.format.lint import lint_returns
 from weighttraj.format.locate import COLLECTED, clone, locate
 from weighttraj.plugins import import_modules
 from weighttraj.remote import RemotePath, here, is_remote
-from weighttraj.terminal import Output, while_read
+from weighttraj.terminal import Output, say, while_read
 
 Imports = Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")]
 """Modules that register environments, of the option --import."""
 
 app = tyro.extras.SubcommandApp()
 console = Output()
-errors = Console(stderr=True)
+errors = Output(stderr=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +65,8 @@ def _collect(args: _Collect) -> None:
         imports=args.imports,
         console=console,
     )
-    print(dataset)
-    print(f"data set in {out}")
+    say(dataset)
+    say(f"data set in {out}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +119,7 @@ def _returns(args: _Returns) -> None:
     )
     for run in dataset:
         if run.evaluation is not None:
-            print(f"{run.id}: mean return of the last snapshot {_last_return(run)}")
+            say(f"{run.id}: mean return of the last snapshot {_last_return(run)}")
         for finding in lint_returns(run):
             errors.print(f"[yellow]look:[/yellow] {escape(str(finding))}")
 
@@ -149,12 +148,12 @@ def _show(
         place = locate(path)
         is_run = not (place / "dataset.json").is_file() and place.suffix != ".h5"
     if not is_run:
-        print(wt.open(path))
+        say(wt.open(path))
         return
     run = wt.open_run(path)
-    print(run)
+    say(run)
     for array in run.arrays.values():
-        print(f"  {array!r}")
+        say(f"  {array!r}")
 
 
 @app.command(name="list")
@@ -251,7 +250,7 @@ def _create(args: _Create) -> None:
         licence=args.licence,
         console=console,
     )
-    print(made)
+    say(made)
 
 
 @app.command(name="combine")
@@ -262,7 +261,7 @@ def _combine(
     out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
 ) -> None:
     """Make one data set of the runs of several; these stay."""
-    print(registry.combine(paths, out, console=console))
+    say(registry.combine(paths, out, console=console))
 
 
 @app.command(name="select")
@@ -274,7 +273,7 @@ def _select(
     """Make a data set of some runs of another one; it says which part it is of what."""
     from weighttraj.collect.recipe import parse_seeds
 
-    print(registry.select(path, out, seeds=parse_seeds(seeds), console=console))
+    say(registry.select(path, out, seeds=parse_seeds(seeds), console=console))
 
 
 @app.command(name="split")
@@ -287,7 +286,7 @@ def _split(
     seed: Annotated[int, tyro.conf.arg(help="of the draw")] = 0,
 ) -> None:
     """Divide the runs of a data set anew, in a new data set."""
-    print(registry.split(path, out, fractions=fractions, seed=seed, console=console))
+    say(registry.split(path, out, fractions=fractions, seed=seed, console=console))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -319,7 +318,7 @@ def _download(args: _Download) -> None:
         revision=args.revision,
         console=console,
     )
-    print(f"{len(dataset)} runs in {dataset.path}")
+    say(f"{len(dataset)} runs in {dataset.path}")
 
 
 @app.command(name="card")
@@ -327,7 +326,7 @@ def _card(
     path: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="data set: path or id")],
 ) -> None:
     """Write the card of a data set, or the facts into the one that is there; and croissant.json."""
-    print(f"card in {registry.write_card(path)}")
+    say(f"card in {registry.write_card(path)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,7 +352,7 @@ def _upload(args: _Upload) -> None:
         private=args.private,
         console=console,
     )
-    print(f"published: {place}")
+    say(f"published: {place}")
 
 
 @app.command(name="delete")
@@ -365,14 +364,14 @@ def _delete(
     place = registry.find(name).path
     if not yes and not _sure(f"remove {name}, all in {place}, from this machine?"):
         raise SystemExit(1)
-    print(f"removed {registry.delete(name)}")
+    say(f"removed {registry.delete(name)}")
 
 
 def _sure(question: str) -> bool:
     try:
-        return Confirm.ask(question)
+        return Confirm.ask(escape(question), console=console)
     except EOFError:  # nobody is there to be asked
-        print("not removed: give --yes where nobody can be asked")
+        say("not removed: give --yes where nobody can be asked")
         return False
 
 
@@ -427,7 +426,7 @@ def _repair(args: _Repair) -> None:
     """Mend what can be mended without training, and say what is left to do."""
     path = locate(args.path)
     for step in wt.repair(path, cut=args.cut):
-        print(step)
+        say(step)
     _finish(path, wt.verify(path, console=console), f"whole{_state_of(path)}")
 
 
@@ -445,7 +444,7 @@ class _Pack:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _pack(args: _Pack) -> None:
     """Write a finished run into one file; the run itself stays."""
-    print(wt.pack(args.path, profile=args.profile, out=args.out))
+    say(wt.pack(args.path, profile=args.profile, out=args.out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -482,7 +481,7 @@ def _report(args: _Report) -> None:
         raise SystemExit(2)
     from weighttraj.publish.report import report
 
-    print(
+    say(
         report(
             locate(args.path),
             args.out or Path("report.html"),
@@ -502,7 +501,7 @@ def _gallery(args: _Report) -> None:
     datasets = {dataset.id: dataset.path for dataset in registry.local_datasets()}
     out = args.out or Path("gallery")
     models = sorted(cards.glob("*.md"))
-    print(gallery(datasets, out, cards=models, film=args.film, console=console))
+    say(gallery(datasets, out, cards=models, film=args.film, console=console))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -523,15 +522,15 @@ class _Export:
 def _export(args: _Export) -> None:
     """Write a run for other programs."""
     if args.to == "hdf5":
-        print(wt.export_hdf5(locate(args.path), args.out))
+        say(wt.export_hdf5(locate(args.path), args.out))
         return
     run = wt.open_run(args.path)
     if args.to == "npy":
-        print(wt.export_npy(run, args.out))
+        say(wt.export_npy(run, args.out))
     elif args.to == "safetensors":
-        print(wt.export_safetensors(run, args.t, args.out))
+        say(wt.export_safetensors(run, args.t, args.out))
     else:
-        print(wt.policies.export_sb3(run, args.t, args.out))
+        say(wt.policies.export_sb3(run, args.t, args.out))
 
 
 @app.command(name="import")
@@ -540,7 +539,7 @@ def _import(
     out: Annotated[Path, tyro.conf.arg(help="folder of the data set to be written")],
 ) -> None:
     """Make a data set of an HDF5 file that `export` wrote; every digest is checked."""
-    print(wt.open(wt.import_hdf5(here(file), out)))
+    say(wt.open(wt.import_hdf5(here(file), out)))
 
 
 @app.command(name="cache")
@@ -551,7 +550,7 @@ def _cache(
     from weighttraj.load import cache_folder, cache_size, clear_cache
 
     size = clear_cache() if clear else cache_size()
-    print(f"{cache_folder()}: {size / 1e6:.1f} MB{' removed' if clear else ''}")
+    say(f"{cache_folder()}: {size / 1e6:.1f} MB{' removed' if clear else ''}")
 
 
 def _state_of(path: Path) -> str:
@@ -573,8 +572,8 @@ def _state_of(path: Path) -> str:
 
 def _finish(path: Path, problems: list[str], otherwise: str) -> None:
     for problem in problems:
-        print(problem)
-    print(f"{path}: {f'{len(problems)} problems' if problems else otherwise}")
+        say(problem)
+    say(f"{path}: {f'{len(problems)} problems' if problems else otherwise}")
     if problems:
         raise SystemExit(1)
 
@@ -584,7 +583,7 @@ def main() -> None:
     try:
         with while_read():
             if sys.argv[1:] == ["--version"]:
-                print(f"weighttraj {wt.__version__}")
+                say(f"weighttraj {wt.__version__}")
                 return
             app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
     except (WeightTrajError, OSError) as error:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from weighttraj.text import printable, shortened
+
+_LONGEST = 4000
+"""Characters of one part of a message: what is quoted may be a stranger's."""
+
 
 class WeightTrajError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -15,7 +20,7 @@ class WeightTrajError(Exception):
         where: object = None,
         do: str | None = None,
     ) -> None:
-        lines = [what]
+        lines = [_told(what)]
         for label, value in (
             ("expected", expected),
             ("got", got),
@@ -23,7 +28,7 @@ class WeightTrajError(Exception):
             ("what to do", do),
         ):
             if value is not None:
-                lines.append(f"  {label}: {value}")
+                lines.append(f"  {label}: {_told(value)}")
         self.message = "\n".join(lines)
         super().__init__(self.message)
 
@@ -32,8 +37,15 @@ class WeightTrajError(Exception):
         return (_rebuild, (type(self), self.message))
 
 
+def _told(value: object) -> str:
+    """Show a part of a message; none of its lines looks like another part."""
+    return printable(shortened(str(value), _LONGEST), lines=True).replace("\n", "\n    ")
+
+
 def _rebuild(kind: type[WeightTrajError], message: str) -> WeightTrajError:
-    return kind(message)
+    error = kind("")
+    error.message, error.args = message, (message,)
+    return error
 
 
 class FormatError(WeightTrajError, ValueError):

@@ -41,6 +41,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import weighttraj as wt
 from tests.small import SMALL_RECIPE
+from weighttraj.atomic import DRAFT
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
 from weighttraj.errors import WeightTrajError
@@ -608,7 +609,8 @@ def _die_at(operation: int, folder: str) -> None:
 
     def hook(event: str, args: tuple[Any, ...]) -> None:
         nonlocal left
-        if event in OPERATIONS and any(folder in str(arg) for arg in args[:2]):
+        ours = (folder in str(arg) or str(arg).endswith(DRAFT) for arg in args[:2])
+        if event in OPERATIONS and any(ours):  # drafts are named from the folder that they are in
             left -= 1
             if left == 0:
                 os.kill(os.getpid(), signal.SIGKILL)

@@ -15,9 +15,10 @@ from safetensors.numpy import load_file
 
 import weighttraj as wt
 from tests.format.test_store import LAYOUT, weights, write
+from weighttraj.atomic import appearing
 from weighttraj.errors import DamageError, StoreExistsError
 from weighttraj.format import ParamLayout, RunInfo, RunWriter
-from weighttraj.format.export import appearing, export_npy, export_safetensors
+from weighttraj.format.export import export_npy, export_safetensors
 from weighttraj.format.reader import PIECE_BYTES
 from weighttraj.format.schema import to_json
 

@@ -217,14 +217,14 @@ original, place, n = storage.replace_file, sys.argv[2], int(sys.argv[3])
 if place == "commit":
     storage.replace_file = kill_at(n)
 else:
-    original, calls = Path.replace, 0
-    def put(draft, target):
+    original, calls = os.replace, 0
+    def put(draft, target, **folders):
         global calls
         calls += 1
         if calls == n:
             os.kill(os.getpid(), signal.SIGKILL)
-        return original(draft, target)
-    Path.replace = put
+        return original(draft, target, **folders)
+    os.replace = put
 with RunWriter(Path(sys.argv[1]), INFO) as writer:
     for t, row in enumerate(weights(20)):
         append(writer, t, row)

@@ -37,7 +37,7 @@ def write(
     path.mkdir(parents=True, exist_ok=True)
     if arrays is not None:
         save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, path / ARRAYS)
-    (path / CONFIG).write_text(json.dumps(config, indent=1))
+    (path / CONFIG).write_text(json.dumps(config, indent=1), encoding="utf-8")
 
 
 def read_settings(path: str | Path, kind: str) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def save_ladder(
         out = Path(folder) / forecaster.name
         forecaster.save(out)
         if settings is not None:
-            (out / "train.json").write_text(json.dumps(settings, indent=1))
+            (out / "train.json").write_text(json.dumps(settings, indent=1), encoding="utf-8")
 
 
 __all__ = ["by_name", "fit_ladder", "names", "save_ladder"]

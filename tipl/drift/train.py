@@ -113,7 +113,9 @@ def train_drift(config: DriftConfig, *, console: Console | None = None) -> Drift
         {"amplitude": factor} | {f"gain_{h}": gain for h, gain in zip(horizons, row, strict=True)}
         for factor, row in zip(factors, gains.tolist(), strict=True)
     ]
-    (config.out / "log.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    (config.out / "log.jsonl").write_text(
+        "".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8"
+    )
     return followed
 
 
@@ -154,7 +156,7 @@ def _followed(
 def _trained_on(along: Path) -> dict[str, Any]:
     """The data sets and runs that the network was trained on, and how, where its folder says so."""
     file = along / "train.json"
-    settings = json.loads(file.read_text()) if file.exists() else {}
+    settings = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     data, runs = settings.pop("data", None), settings.pop("runs", None)
     settings.pop("out", None)
     return {"data": data, "runs": runs, "of_gate": settings}

@@ -106,7 +106,7 @@ def evaluate(
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     }
     config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / "results.json").write_text(json.dumps(results, indent=1))
+    (config.out / "results.json").write_text(json.dumps(results, indent=1), encoding="utf-8")
     write_report(results, config.out)
     return results
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import tempfile
 import zipfile
@@ -15,6 +14,7 @@ import numpy as np
 
 from tipl.forecast import Forecaster
 from weighttraj import Run
+from weighttraj.atomic import replacing
 
 Arrays = dict[str, np.ndarray]
 
@@ -72,11 +72,8 @@ def _read(path: Path, wanted: str) -> Arrays | None:
 
 def _write(path: Path, source: str, arrays: Arrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, source=np.array(source), **arrays)  # type: ignore[arg-type]
-    draft = path.with_suffix(".draft")
-    draft.write_bytes(buffer.getvalue())
-    draft.replace(path)
+    with replacing(path) as file:
+        np.savez_compressed(file, source=np.array(source), **arrays)  # type: ignore[arg-type]
 
 
 __all__ = ["Arrays", "Parts", "fingerprint", "run_source"]

@@ -91,13 +91,13 @@ def insert_markdown(results: dict[str, Any], source: Path, page: Path) -> None:
     Raises:
         EvaluateError: the page has no such place, or one asks for a section that there is not.
     """
-    old = page.read_text()
+    old = page.read_text(encoding="utf-8")
     text = rewrite(old, "results", source.as_posix(), lambda s: render(results, source, s))
     for place in places(text):
         if (place.source, place.section) == (source.as_posix(), "figures"):
             _draw(results, page.parent / source.stem)
             break
-    page.write_text(text)
+    page.write_text(text, encoding="utf-8")
 
 
 def render(results: dict[str, Any], source: Path, section: str) -> str:

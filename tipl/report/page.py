@@ -29,7 +29,7 @@ def write_report(results: dict[str, Any], out: Path) -> Path:
         cell=cell,
     )
     path = out / "report.html"
-    path.write_text(page)
+    path.write_text(page, encoding="utf-8")
     return path
 
 

@@ -33,7 +33,7 @@ def read_results(file: Path) -> dict[str, Any]:
         FileNotFoundError: it is not there.
     """
     try:
-        document = json.loads(file.read_text())
+        document = json.loads(file.read_text(encoding="utf-8"))
         known = {"forecasters", "data", "runs", "horizons"} <= document.keys()
     except (ValueError, AttributeError):
         known = False

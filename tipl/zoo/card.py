@@ -73,10 +73,10 @@ def write_card(name: str, out: Path) -> Path:
     metrics = metrics_of(name)
     out.mkdir(parents=True, exist_ok=True)
     card = out / f"{name}.md"
-    text = card.read_text() if card.exists() else new_card(metrics)
-    card.write_text(refreshed(text, metrics))
+    text = card.read_text(encoding="utf-8") if card.exists() else new_card(metrics)
+    card.write_text(refreshed(text, metrics), encoding="utf-8")
     if metrics.log and metrics.kind != "drift":
-        (out / f"{name}.svg").write_text(svg(training_figure(metrics)))
+        (out / f"{name}.svg").write_text(svg(training_figure(metrics)), encoding="utf-8")
     return card
 
 

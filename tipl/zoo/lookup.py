@@ -91,7 +91,7 @@ def kind_of(folder: Path) -> str:
         ModelError: it holds none.
     """
     try:
-        kind = str(json.loads((folder / "config.json").read_text())["kind"])
+        kind = str(json.loads((folder / "config.json").read_text(encoding="utf-8"))["kind"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise _nothing(folder, error) from error
     if kind not in KINDS:

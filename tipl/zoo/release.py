@@ -164,7 +164,7 @@ def thinned(log: Path) -> list[dict[str, float]]:
     """At most ``LINES`` lines of a log, evenly spaced on a logarithmic scale of batches."""
     if not log.exists():
         return []
-    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     last = len(lines) - 1
     chosen = np.unique(np.geomspace(1, last + 1, min(LINES, last + 1)).round().astype(int)) - 1
     return [{k: v for k, v in lines[i].items() if k not in _OF_THE_SPEED} for i in chosen]
@@ -277,7 +277,7 @@ def _nested(scores: dict[str, Any]) -> dict[str, Any]:
 
 
 def _json(file: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     return found
 
 

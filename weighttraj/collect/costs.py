@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from weighttraj.atomic import appending
+
 COSTS = ".costs.jsonl"
 """Hidden file in a data set's folder, so it is no object of the data set and is not published."""
 
@@ -37,14 +39,18 @@ def measured(folder: Path, finished: Callable[[], Sequence[int]]) -> Iterator[No
             "wall_s": round(time.monotonic() - wall, 1),
         }
         if folder.is_dir() and (stopped or line["seeds"]):
-            with (folder / COSTS).open("a") as file:
-                file.write(f"{json.dumps(line)}\n")
+            with appending(folder / COSTS, root=folder) as file:
+                file.write(f"{json.dumps(line)}\n".encode())
 
 
 def read_costs(folder: Path) -> list[dict[str, Any]]:
     """Return what was written down of the collections into a folder, the first one first."""
     file = folder / COSTS
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    return (
+        [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        if file.is_file()
+        else []
+    )
 
 
 def _cpu_seconds() -> float:

@@ -444,7 +444,7 @@ def _plain(value: Any) -> Any:
 
 def _cpu() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor()
     return next((s.split(":", 1)[1].strip() for s in lines if s.startswith("model name")), "")

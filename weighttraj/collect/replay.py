@@ -15,11 +15,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.describe import describe_provenance
-from weighttraj.collect.population import Population, origins_of
+from weighttraj.collect.population import Population, check_config, origins_of
 from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.recipe import Recipe, Store, parse_seeds
 from weighttraj.collect.tasks import open_recorder
-from weighttraj.errors import CollectError
+from weighttraj.errors import CollectError, WeightTrajError
 from weighttraj.format import Run, open_dataset, open_run
 from weighttraj.format.writer import explain_difference
 
@@ -68,7 +68,20 @@ def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
             do="verify the data sets that it was made of",
         ) from error
     recipe.check(where=path)
-    return _compare(runs[0], recipe, min(n, len(runs[0])))
+    if recipe.collect.collector == "population":
+        check_config(recipe.ppo)
+    try:
+        return _compare(runs[0], recipe, min(n, len(runs[0])))
+    except WeightTrajError:
+        raise
+    except Exception as error:  # the environment's, Gymnasium's, SB3's: the recipe is a stranger's
+        raise CollectError(
+            "the training that the data set names cannot be done here",
+            expected="its recipe, environment and versions",
+            got=repr(error),
+            where=f"{path}, run {runs[0].id}",
+            do="compare run.info.provenance.packages with what is installed",
+        ) from error
 
 
 def _compare(run: Run, recipe: Recipe, n: int) -> list[str]:

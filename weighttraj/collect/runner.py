@@ -10,10 +10,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from weighttraj.atomic import lock_of, refuse_link
 from weighttraj.collect.costs import measured
 from weighttraj.collect.recipe import Recipe, parse_seeds
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
@@ -152,6 +153,8 @@ def _settled(out: Path, entry: RunEntry) -> RunEntry:
     """The entry of a run, packed if it is finished; its folder goes once the file is listed."""
     folder = entry.path.removesuffix(PACKED)
     packed = f"{folder}{PACKED}"
+    for name in (folder, packed):
+        refuse_link(out / name, out)  # what a link leads to is not written, nor removed
     if not (out / packed).is_file():
         return entry
     if entry.path == packed and (out / folder).is_dir():
@@ -257,7 +260,8 @@ def _start_over(out: Path, task: Task, error: ReplayError, console: Console) -> 
     write_dataset_info(out, replace(info, runs=tuple(new if r is old else r for r in info.runs)))
     console.print(
         f"seed {task.seed}: {error}\n"
-        f"seed {task.seed}: starting over as {name}; what it had committed stays in {old.path}"
+        f"seed {task.seed}: starting over as {name}; what it had committed stays in {old.path}",
+        markup=False,
     )
     return replace(task, path=out / new.path)
 
@@ -266,11 +270,12 @@ def _start_over(out: Path, task: Task, error: ReplayError, console: Console) -> 
 def _lock(out: Path, console: Console) -> Iterator[None]:
     """Held while ``dataset.json`` is read and written: several may collect into one data set."""
     place = out.resolve()  # as of who evaluates it
-    lock = FileLock(place.with_name(f".{place.name}.lock"))
+    lock = lock_of(place.with_name(f".{place.name}.lock"))
     try:
         lock.acquire(timeout=1)
     except Timeout:
-        console.print(f"waiting for another process, which is changing {out}: its returns, say")
+        said = f"waiting for another process, which is changing {out}: its returns, say"
+        console.print(said, markup=False)
         lock.acquire()
     try:
         yield

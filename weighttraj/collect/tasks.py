@@ -14,6 +14,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from weighttraj.atomic import refuse_link
 from weighttraj.collect.agents import find_agent
 from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.describe import describe_algorithm, describe_run
@@ -73,6 +74,7 @@ def collect_block(tasks: Sequence[Task], report: Report) -> list[Failure]:
     _check_folder(tasks[0].path.parents[1])
     for task in tasks:
         with _noted(task, failures):
+            refuse_link(task.path, task.path.parents[1])
             unfinished += [] if _is_complete(task.path) else [task]
     with one_torch_thread():
         if tasks[0].recipe.collect.collector == "population":

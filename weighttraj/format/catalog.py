@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from weighttraj.atomic import replace_file
 from weighttraj.errors import DamageError, FormatError
-from weighttraj.format.objects import FolderObjects, check_name, replace_file
+from weighttraj.format.objects import FolderObjects, check_name, check_size, read_document
 from weighttraj.format.schema import DatasetInfo, load_json, parse, to_json
 from weighttraj.format.storage import checksum
 
@@ -44,7 +45,7 @@ def read_dataset_info(path: Path) -> DatasetInfo:
     file = path / DATASET
     if not file.is_file():
         raise FileNotFoundError(f"no data set at {path}: it has no {DATASET}")
-    return parse_dataset(FolderObjects(path).read(DATASET) or b"", file)
+    return parse_dataset(read_document(FolderObjects(path), DATASET) or b"", file)
 
 
 def parse_dataset(content: bytes, where: object) -> DatasetInfo:
@@ -71,7 +72,8 @@ def dataset_document(info: DatasetInfo) -> bytes:
 
 def write_dataset_info(path: Path, info: DatasetInfo) -> None:
     """Replace ``dataset.json``."""
-    replace_file(path / DATASET, dataset_document(info))
+    content = check_size(dataset_document(info), path / DATASET)
+    replace_file(path / DATASET, content, root=path)
 
 
 def write_manifest(path: Path) -> None:
@@ -85,7 +87,8 @@ def write_manifest(path: Path) -> None:
     for name in sorted(_objects(path)):
         line = _line(FolderObjects(path), name)
         lines.append(f"{line.sha256}  {line.size}  {line.path}\n")
-    replace_file(path / MANIFEST, "".join(lines).encode())
+    content = check_size("".join(lines).encode(), path / MANIFEST)
+    replace_file(path / MANIFEST, content, root=path)
 
 
 def check_file_names(path: Path) -> None:
@@ -109,7 +112,7 @@ def check_file_names(path: Path) -> None:
 
 def read_manifest(path: Path) -> list[ManifestLine]:
     """Lines of the manifest of the data set in a folder; raises as ``parse_manifest`` does."""
-    return parse_manifest(FolderObjects(path).read(MANIFEST), path)
+    return parse_manifest(read_document(FolderObjects(path), MANIFEST), path)
 
 
 def parse_manifest(content: bytes | None, where: object) -> list[ManifestLine]:

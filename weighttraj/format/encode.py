@@ -14,6 +14,7 @@ import google_crc32c
 import numpy as np
 from numcodecs import blosc
 
+from weighttraj.atomic import replacing
 from weighttraj.errors import DamageError
 from weighttraj.format.codecs import unshard
 from weighttraj.format.schema import ArraySpec
@@ -43,24 +44,30 @@ class ObjectEncoder:
         self._blosc = codecs[1]["configuration"]
         self._counts = tuple(o // c for o, c in zip(outer, self._chunk, strict=True))
 
-    def write(self, path: Path, rows: Sequence[np.ndarray] | np.ndarray) -> str:
+    def write(self, root: Path, key: str, rows: Sequence[np.ndarray] | np.ndarray) -> str:
         """Write one object so that readers see all of it or none; read it back and compare.
 
         Fewer rows than a chunk has are filled up. One chunk at a time is in memory.
+
+        Args:
+            root: folder of the run.
+            key: name of the object in it.
+            rows: what it holds.
 
         Returns:
             The crc32c of each chunk, hexadecimal.
 
         Raises:
             DamageError: a chunk does not decode to what was encoded, or reads back differently.
+            FormatError: a folder on the way is a link.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(f".{path.name}.draft")
+        path = root / key
         places = list(np.ndindex(*self._counts[1:]))
         head = 16 * len(places) + 4 if self._sharded else 0
         table: list[tuple[int, int]] = []
         tags: list[str] = []
-        with draft.open("wb") as file:
+        # The commit sees all objects of a block on the disk at once.
+        with replacing(path, root=root, durable=False) as file:
             file.seek(head)
             for place in places:
                 data = self._encode(rows, place)
@@ -71,7 +78,6 @@ class ObjectEncoder:
                 index = np.array(table, "<u8").tobytes()
                 file.seek(0)
                 file.write(index + _crc(index))
-        draft.replace(path)
         with path.open("rb") as file:
             same = not self._sharded or file.read(head) == index + _crc(index)
             # A chunk's own checksum makes every whole chunk look alike: compare these too.

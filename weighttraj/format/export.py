@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
-import os
-import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from weighttraj.atomic import appearing
 from weighttraj.errors import missing_extra
-from weighttraj.format.objects import refuse_existing, sync
 from weighttraj.format.reader import Run, StoredArray
 from weighttraj.format.schema import to_json
-
-
-@contextlib.contextmanager
-def appearing(path: Path) -> Iterator[Path]:
-    """A draft beside a path, to be made into a file or a folder; it gets the path's name if whole.
-
-    Whatever stops the process, there is nothing at the path, or all of it.
-
-    Raises:
-        StoreExistsError: the path exists.
-    """
-    refuse_existing(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    _remove(draft)  # of a killed process with the same number
-    try:
-        yield draft
-        for file in (draft, *draft.rglob("*")):
-            sync(file)
-        refuse_existing(path)
-        draft.rename(path)
-        sync(path.parent)
-    finally:
-        _remove(draft)
 
 
 def export_npy(run: Run, folder: str | Path) -> Path:
@@ -73,7 +46,7 @@ def export_npy(run: Run, folder: str | Path) -> Path:
         _write_csv(draft / "layout.csv", ("name", "shape", "offset", "size", "role"), params)
         columns = {"t": list(range(len(run))), **_scalars(run)}
         _write_csv(draft / "snapshots.csv", columns, zip(*columns.values(), strict=True))
-        (draft / "run.json").write_text(json.dumps(to_json(run.info), indent=1))
+        (draft / "run.json").write_text(json.dumps(to_json(run.info), indent=1), encoding="utf-8")
     return folder
 
 
@@ -148,11 +121,4 @@ def _write_csv(file: Path, header: Iterable[str], lines: Iterable[Iterable[Any]]
         writer.writerows(lines)
 
 
-def _remove(draft: Path) -> None:
-    if draft.is_dir():
-        shutil.rmtree(draft)
-    else:
-        draft.unlink(missing_ok=True)
-
-
-__all__ = ["appearing", "export_npy", "export_safetensors"]
+__all__ = ["export_npy", "export_safetensors"]

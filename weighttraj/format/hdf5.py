@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from weighttraj.atomic import appearing
 from weighttraj.errors import DamageError, FormatError, missing_extra
 
 try:
@@ -31,7 +32,6 @@ from weighttraj.format.catalog import (
     write_dataset_info,
 )
 from weighttraj.format.codecs import PACKED_CHUNK_BYTES, part_of_row, row_bytes
-from weighttraj.format.export import appearing
 from weighttraj.format.hdf5_store import (
     MAX_METADATA_BYTES,
     RUN,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import itertools
 import json
 import math
@@ -17,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from weighttraj.atomic import links_in, refuse_link, remove_abandoned, sync
 from weighttraj.errors import DamageError, FormatError, WeightTrajError
 from weighttraj.format.catalog import (
     MANIFEST,
@@ -28,13 +30,13 @@ from weighttraj.format.catalog import (
 from weighttraj.format.codecs import rows_in_block
 from weighttraj.format.fit import find_misfit
 from weighttraj.format.live import LiveStore
-from weighttraj.format.objects import ZipObjects, sync
+from weighttraj.format.objects import ZipObjects, read_document
 from weighttraj.format.packing import same_as_packed
 from weighttraj.format.reader import Dataset, Run, StoredArray, open_dataset, open_run
 from weighttraj.format.returns import drop_returns, locked_path
 from weighttraj.format.schema import AXES, RETURNS, Axis, load_json
-from weighttraj.format.storage import PACKED, RunStore, member_documents, object_grid
-from weighttraj.format.tables import write_tables
+from weighttraj.format.storage import MAX_METADATA, PACKED, RunStore, member_documents, object_grid
+from weighttraj.format.tables import check_tables, write_tables
 from weighttraj.format.writer import lock_run
 from weighttraj.remote.address import here
 
@@ -48,8 +50,8 @@ def verify(path: str | Path, *, deep: bool = False, console: Console | None = No
     """Problems of the data set, run or HDF5 file at a path; an empty list means that it is whole.
 
     Every byte is read. Of a complete data set, each object is compared with its hash in the
-    manifest and each snapshot with its digest. Of anything else, or with ``deep``, every chunk is
-    decoded too, counters must not go back and weights must be finite.
+    manifest, each snapshot with its digest, and the tables with the runs. Of anything else, or with
+    ``deep``, every chunk is decoded too, counters must not go back and weights must be finite.
 
     Args:
         path: data set, run or HDF5 file.
@@ -65,7 +67,7 @@ def verify(path: str | Path, *, deep: bool = False, console: Console | None = No
             return _verify_dataset(open_dataset(path), deep, console or Console(quiet=True))
         if path.suffix == ".h5":
             return [p for run in open_dataset(path) for p in _verify_arrays(run, deep=True)]
-        return list(_verify_run(open_run(path), deep=True))
+        return [*links_in(path), *_verify_run(open_run(path), deep=True)]
     except WeightTrajError as error:
         return [str(error)]
 
@@ -136,7 +138,7 @@ def repair(path: str | Path, *, cut: bool = False) -> list[str]:
         damaged = [entry for entry in again if _problems_of(path / entry)]
         if damaged or read_dataset_info(path).status != "complete":
             return [*done, "the manifest is not written again: the data set is not whole"]
-        if check_manifest_quietly(path):
+        if check_manifest_quietly(path) or check_tables(open_dataset(path)):
             seal(path)
             done.append(f"{path}: tables and manifest written anew")
     return done
@@ -153,18 +155,21 @@ def check_manifest_quietly(path: Path, shown: Callable[..., Any] = iter) -> list
 def _verify_dataset(dataset: Dataset, deep: bool, console: Console) -> list[str]:
     bar = partial(track, console=console, disable=console.quiet, transient=True)
     complete, path = dataset.info.status == "complete", Path(dataset.path)
-    problems = check_manifest_quietly(path, partial(bar, description="files")) if complete else []
+    problems = list(links_in(path))
+    problems += check_manifest_quietly(path, partial(bar, description="files")) if complete else []
     for run in bar(dataset.runs, description="runs"):
         try:
             problems += _verify_run(run, deep=deep or not complete)
         except WeightTrajError as error:
             problems.append(str(error))
+    if complete and not problems:
+        problems += check_tables(dataset)
     return problems
 
 
 def _problems_of(path: Path) -> list[str]:
     try:
-        return list(_verify_run(open_run(path), deep=True))
+        return [*links_in(path), *_verify_run(open_run(path), deep=True)]
     except (WeightTrajError, FileNotFoundError) as error:
         return [str(error)]
 
@@ -188,12 +193,12 @@ def _verify_arrays(run: Run, *, deep: bool) -> Iterator[str]:
 
 def _verify_objects(store: RunStore) -> Iterator[str]:
     """Objects that are missing or strange, and metadata that are not as they were written."""
-    text = store.objects.read("zarr.json") or b""
+    text = read_document(store.objects, "zarr.json", MAX_METADATA) or b""
     if json.dumps(json.loads(text), indent=1).encode() != text:
         yield f"{store.path}, zarr.json: not in the form in which it was written"
     documents = member_documents(store.documents)
     for name, content in documents.items():
-        got = store.objects.read(name) or b""
+        got = read_document(store.objects, name) or b""
         if got != content and not _is_earlier(store, name, got):
             yield (
                 f"{store.path}, {name}: not what the run's metadata says; a writer was "
@@ -271,7 +276,7 @@ def _names(store: RunStore) -> Iterator[str]:
 
 def _repair_entry(dataset: Path, entry: str, cut: bool) -> list[str]:
     """Repair one run of a data set; a packed one that is damaged can only be made again."""
-    path = dataset / entry
+    path = refuse_link(dataset / entry, dataset)
     if not path.exists():
         return (
             [f"{path}: missing; collect the recipe again"] if not cut else _forget(dataset, entry)
@@ -363,8 +368,9 @@ def _sweep(store: LiveStore) -> None:
     for name in _names(store):
         if not _is_chunk(store, name) and name not in documents and name != "zarr.json":
             (store.path / name).unlink()
-    for draft in store.path.parent.glob(f".{store.path.name}.*"):
-        if _DRAFT.fullmatch(draft.name):
+    remove_abandoned(store.path)
+    for draft in store.path.parent.glob(f".{glob.escape(store.path.name)}.*"):
+        if _DRAFT.fullmatch(draft.name) and draft.is_dir() and not draft.is_symlink():
             shutil.rmtree(draft)
 
 

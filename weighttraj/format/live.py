@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import json
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +16,14 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
+from weighttraj.atomic import DRAFT, drafting, refuse_existing, replace_file, sync
 from weighttraj.errors import DamageError, FormatError, MissingExtraError
 from weighttraj.format.codecs import create_array, quiet_codecs, rows_in_block
 from weighttraj.format.encode import ObjectEncoder
-from weighttraj.format.objects import FolderObjects, refuse_existing, replace_file, sync
+from weighttraj.format.objects import FolderObjects, check_size
 from weighttraj.format.schema import AXES, RunInfo, arrays_of
 from weighttraj.format.storage import (
+    MAX_METADATA,
     PACKED,
     Documents,
     Metadata,
@@ -77,15 +77,14 @@ class LiveStore(RunStore):
         refuse_existing(path, "choose another path, delete it, or continue with resume=True")
         if packed_rows is None:
             info = replace(info, block=_block(info))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-        shutil.rmtree(draft, ignore_errors=True)
-        documents = empty_arrays(draft, info, list(arrays_of(info)), packed_rows)
-        tags = dict.fromkeys(documents, "")
-        store = cls(FolderObjects(draft), Metadata(info=info, documents=documents, tags=tags))
-        store.commit(info)
-        _check_readable(store)
-        draft.rename(path)
+        with drafting(path) as folder:
+            draft = folder / path.name
+            documents = empty_arrays(draft, info, list(arrays_of(info)), packed_rows)
+            tags = dict.fromkeys(documents, "")
+            store = cls(FolderObjects(draft), Metadata(info=info, documents=documents, tags=tags))
+            store.commit(info)
+            _check_readable(store)
+            draft.rename(path)
         sync(path.parent)
         store.objects = FolderObjects(path)
         return store
@@ -102,6 +101,8 @@ class LiveStore(RunStore):
             raise FormatError("a packed run is finished; nothing can be added", where=path)
         objects = FolderObjects(Path(path))
         store = cls(objects, read_metadata(objects))
+        for draft in objects.path.rglob(f".*{DRAFT}"):  # of a killed writer
+            draft.unlink()
         store.write_members()
         return store
 
@@ -120,8 +121,8 @@ class LiveStore(RunStore):
             if encoder is None:
                 tags = self._tags_on_disk(name, first // size)
             else:
-                path = self.path / self._key(name, first // size)
-                tags = encoder.write(path, rows[first - start : first - start + size])
+                key = self._key(name, first // size)
+                tags = encoder.write(self.path, key, rows[first - start : first - start + size])
             place = first // size * len(tags)
             self.tags[name] = self.tags[name][:place] + tags + self.tags[name][place + len(tags) :]
         self._unsynced |= self._files(name, start, start + len(rows))
@@ -204,7 +205,8 @@ class LiveStore(RunStore):
         tags = {n: self._final(n, self.tags[n], documents[n], info) for n in self.specs}
         tags |= {name: tag for name, tag in self.tags.items() if name not in self.specs}
         content = group_document(info, documents, tags, self.attributes)
-        replace_file(self.path / "zarr.json", content)
+        check_size(content, self.path / "zarr.json", MAX_METADATA)
+        replace_file(self.path / "zarr.json", content, root=self.path)
         self.info, self.documents, self.tags = info, documents, tags
         self._decoders.clear()
         self.write_members()
@@ -228,10 +230,8 @@ class LiveStore(RunStore):
         Readers of single arrays look there; those of the run, here or in plain Zarr, do not.
         """
         for name, content in member_documents(self.documents).items():
-            file = Path(self.objects.file(name))  # no link that leads elsewhere
-            if not file.is_file() or file.read_bytes() != content:
-                file.parent.mkdir(parents=True, exist_ok=True)
-                replace_file(file, content, durable=durable)
+            if self.objects.read(name, 0, len(content) + 1) != content:
+                replace_file(self.path / name, content, root=self.path, durable=durable)
 
     def _files(self, name: str, start: int, stop: int) -> set[Path]:
         """Files and folders that hold some rows of an array."""
@@ -266,7 +266,6 @@ def _check_readable(store: LiveStore) -> None:
     try:
         read_metadata(store.objects)
     except FormatError as error:
-        shutil.rmtree(store.path, ignore_errors=True)
         raise FormatError(
             "a run that is described so could not be read",
             got=error,
@@ -316,8 +315,7 @@ class _BlockStore(LocalStore):
         if key in self._metadata:
             self._metadata[key] = value.to_bytes()
         else:
-            FolderObjects(self.root).file(key)  # no link that leads elsewhere
-            await super().set(key, value)
+            replace_file(self.root / key, value.to_bytes(), root=self.root, durable=False)
 
 
 def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]:

@@ -62,8 +62,16 @@ def folders() -> list[Path]:
     """Folders in which data sets are looked for, the first one first."""
     named = [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
     own = clone()
-    kept = [Path(name).expanduser() for name in named or [HOME]]
-    return [*kept, *([own] if own else []), Path(COLLECTED)]
+    return [*map(_expanded, named or _home()), *([own] if own else []), Path(COLLECTED)]
+
+
+def _home() -> list[str]:
+    """The folder that is used where the variable names none; nothing: the user has no home."""
+    return [HOME] if os.path.expanduser("~") != "~" else []
+
+
+def _expanded(name: str) -> Path:
+    return Path(os.path.expanduser(name))
 
 
 def clone() -> Path | None:

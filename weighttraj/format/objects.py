@@ -15,8 +15,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from weighttraj.errors import DamageError, FormatError, StoreExistsError, WeightTrajError
-from weighttraj.remote.address import Place, new_path
+from weighttraj.atomic import linked
+from weighttraj.errors import DamageError, FormatError, WeightTrajError
+from weighttraj.remote.address import Place
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _LOCAL_HEADER = b"PK\x03\x04"
@@ -24,6 +25,9 @@ _PIECE_BYTES = 4 << 20
 
 MAX_DIRECTORY = 64 << 20
 """Bytes of a zip file's directory, at most: half a million members."""
+
+MAX_DOCUMENT_BYTES = 64 << 20
+"""Bytes of a JSON document or a manifest that are read: more could fill the memory."""
 MAX_NAME = 200
 """Characters between two slashes of a name: file systems take 255, drafts have longer ones."""
 
@@ -135,14 +139,7 @@ class FolderObjects:
         """Path of an object, which is no link."""
         path = f"{self._root}/{check_name(name, self.path)}"
         if os.path.realpath(path) != path:
-            raise FormatError(
-                "a file of the data is a link",
-                expected="plain files: a link could lead anywhere",
-                got=f"{path} -> {os.path.realpath(path)}",
-                where=self.path,
-                do="do not use data from a source that you do not trust; "
-                "if the link is yours, put the file in its place",
-            )
+            raise linked(path, os.path.realpath(path))
         return path
 
 
@@ -286,6 +283,34 @@ class _BlobFile(io.RawIOBase):
         return content
 
 
+def read_document(objects: Objects, name: str, limit: int = MAX_DOCUMENT_BYTES) -> bytes | None:
+    """Return an object that must not be large, such as metadata; None: there is none.
+
+    Raises:
+        FormatError: it has more bytes than the limit. So much is read, and no more.
+    """
+    content = objects.read(name, 0, limit + 1)
+    return None if content is None else check_size(content, f"{objects.path}, {name}", limit)
+
+
+def check_size(content: bytes, where: object, limit: int = MAX_DOCUMENT_BYTES) -> bytes:
+    """Return metadata that readers accept.
+
+    Raises:
+        FormatError: they have more bytes than the limit.
+    """
+    if len(content) > limit:
+        raise FormatError(
+            "refused: the metadata is too large",
+            expected=f"at most {limit:,} bytes",
+            got="more",
+            where=where,
+            do="do not use data from a source that you do not trust; "
+            "data of your own is to be divided into more runs or data sets",
+        )
+    return content
+
+
 def replaced(where: object) -> FormatError:
     """The error for a packed run that is not the one any more that was opened."""
     return FormatError(
@@ -311,23 +336,6 @@ def check_name(name: str, where: object) -> str:
             do="do not use data from a source that you do not trust",
         )
     return name
-
-
-def refuse_existing(path: Path, do: str = "choose another path, or delete it") -> None:
-    """Refuse to overwrite anything.
-
-    Raises:
-        StoreExistsError: the path exists.
-        RegistryError: it is an address.
-    """
-    if new_path(path).exists():
-        raise StoreExistsError(
-            "the path to be written exists",
-            expected="a new path",
-            got="a folder" if path.is_dir() else "a file",
-            where=path,
-            do=do,
-        )
 
 
 def missing_object(name: str, where: object) -> DamageError:
@@ -401,28 +409,6 @@ def read_plain(path: Path, limit: int) -> bytes:
         where=path,
         do="if it is yours, put the file itself in its place",
     )
-
-
-def replace_file(path: Path, content: bytes, *, durable: bool = True) -> None:
-    """Write a file so that readers see the old content or the new; durable: after a power cut."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    with draft.open("wb") as file:
-        file.write(content)
-        file.flush()
-        if durable:
-            os.fsync(file.fileno())
-    draft.replace(path)
-    if durable:
-        sync(path.parent)
-
-
-def sync(path: Path) -> None:
-    """See a file or folder on the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _read_range(handle: int, offset: int, size: int, start: int, stop: int | None) -> bytes:

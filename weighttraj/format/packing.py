@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
-import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock, Timeout
 
+from weighttraj.atomic import drafting, sync
 from weighttraj.errors import FormatError
 from weighttraj.format.live import LiveStore
-from weighttraj.format.objects import ZipObjects, sync, write_zip
+from weighttraj.format.objects import ZipObjects, write_zip
 from weighttraj.format.schema import AXES, Profile, RunInfo, arrays_of
 from weighttraj.format.storage import PACKED, RunStore, group_document
 from weighttraj.remote.address import Place, RemotePath, here, new_path
@@ -137,8 +135,7 @@ def _write(source: RunStore, info: RunInfo, snapshots: slice, target: Path) -> N
         snapshots: which of the source's.
         target: the file.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with _drafting(target) as folder:
+    with drafting(target) as folder:
         live = LiveStore.create(
             folder / "run.zarr",
             replace(info, n_committed=0, n_committed_iterations=0),
@@ -168,7 +165,7 @@ def copy_packed(path: Path, out: Path, run_id: str) -> None:
     """
     store, source = RunStore.open(path), ZipObjects(path)
     info = replace(store.info, run_id=run_id)
-    with _drafting(out) as folder:
+    with drafting(out) as folder:
         metadata = folder / "zarr.json"
         metadata.write_bytes(group_document(info, store.documents, store.tags, store.attributes))
         draft = folder / "run.zip"
@@ -179,21 +176,6 @@ def copy_packed(path: Path, out: Path, run_id: str) -> None:
         sync(draft)
         draft.replace(out)
     sync(out.parent)
-
-
-@contextlib.contextmanager
-def _drafting(target: Path) -> Iterator[Path]:
-    """A folder beside a file, for what becomes the file. Those that killed processes left go."""
-    for old in target.parent.glob(f".{glob.escape(target.name)}.*.draft"):
-        if (lock := old / "lock").exists():  # and nobody holds it
-            with contextlib.suppress(Timeout), FileLock(lock, timeout=0):
-                shutil.rmtree(old)
-    name = tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".draft", dir=target.parent)
-    try:
-        with FileLock(Path(name) / "lock"):
-            yield Path(name)
-    finally:
-        shutil.rmtree(name, ignore_errors=True)
 
 
 def same_as_packed(path: Path) -> bool:

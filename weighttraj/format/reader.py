@@ -29,6 +29,7 @@ from weighttraj.format.schema import (
 )
 from weighttraj.format.storage import PACKED, RunStore
 from weighttraj.remote.address import Place, RemotePath, is_remote
+from weighttraj.text import printable
 
 if TYPE_CHECKING:
     from weighttraj.collect.into import Target
@@ -410,7 +411,7 @@ class Run:
         info = self.info
         what = [info.algorithm.name] if info.algorithm else []
         what += [info.env.id] if info.env else []
-        return (
+        return printable(
             f"<Run {self.id}: {' '.join(what)} seed {info.seed}, weights "
             f"(time {len(self)}, param {self.layout.size}), {info.status}>"
         )
@@ -500,7 +501,7 @@ class Dataset:
         return iter(self.runs)
 
     def __repr__(self) -> str:
-        whole = f" ({self.info.part} runs of the whole)" if self.info.part else ""
+        whole = f" ({printable(self.info.part)} runs of the whole)" if self.info.part else ""
         lines = [f"<Dataset {self.info.id} ({self.info.status}), {len(self)} runs{whole}>"]
         return "\n".join(lines + [f"  {run.split or '-':<10} {run!r}" for run in self.runs])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from weighttraj.atomic import drafting, sync
 from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.live import LiveStore, empty_arrays
-from weighttraj.format.objects import FolderObjects, ZipObjects, sync, write_zip
+from weighttraj.format.objects import FolderObjects, ZipObjects, write_zip
 from weighttraj.format.packing import packed_order
 from weighttraj.format.schema import AXES, RETURNS, Evaluation, RunInfo
 from weighttraj.format.storage import (
@@ -172,9 +172,7 @@ def _write_folder(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarra
 def _write_file(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]) -> None:
     """Write a packed run anew: with these returns, or with none."""
     path = Path(store.path)
-    folder = path.with_name(f".{path.name}.returns.draft")
-    shutil.rmtree(folder, ignore_errors=True)  # of a killed process
-    try:
+    with drafting(path) as folder:
         live = _new_objects(folder / "run.zarr", store, info, values)
         draft = folder / "run.zip"
         source = ZipObjects(path)
@@ -183,8 +181,6 @@ def _write_file(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]
         _compare(source, kept, RunStore.open(draft), values)
         sync(draft)
         draft.replace(path)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     sync(path.parent)
 
 

@@ -19,6 +19,7 @@ from weighttraj.format.objects import (
     Objects,
     ZipObjects,
     check_name,
+    read_document,
 )
 from weighttraj.format.schema import RunInfo, arrays_of, load_json, parse, to_json
 from weighttraj.remote.address import Place, RemotePath
@@ -177,14 +178,7 @@ def read_metadata(objects: Objects) -> Metadata:
         DamageError: it does not match its checksum.
     """
     where = f"{objects.path}, zarr.json"
-    content = objects.read("zarr.json", 0, MAX_METADATA + 1) or b""
-    if len(content) > MAX_METADATA:
-        raise FormatError(
-            "refused: the metadata of a run are larger than any reader should take",
-            expected=f"at most {MAX_METADATA} bytes",
-            where=where,
-            do="do not use data from a source that you do not trust",
-        )
+    content = read_document(objects, "zarr.json", MAX_METADATA) or b""
     document = load_json(content, where)
     attributes = document.get("attributes") if isinstance(document, dict) else None
     if not isinstance(attributes, dict) or ATTRIBUTE not in attributes:

@@ -14,6 +14,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike
 
+from weighttraj.atomic import lock_of
 from weighttraj.errors import FormatError, ReplayError, SnapshotError, StoreLockedError
 from weighttraj.format.live import LiveStore
 from weighttraj.format.schema import (
@@ -284,8 +285,9 @@ def lock_run(path: Path) -> FileLock:
 
     Raises:
         StoreLockedError: another process holds it.
+        FormatError: its file is a link.
     """
-    lock = FileLock(path.with_name(path.name + ".lock"))
+    lock = lock_of(path.with_name(path.name + ".lock"))
     try:
         lock.acquire(timeout=0)
     except Timeout as error:

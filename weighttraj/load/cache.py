@@ -11,7 +11,6 @@ import hashlib
 import io
 import os
 import re
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -21,15 +20,15 @@ import numpy as np
 from filelock import FileLock
 from jaxtyping import Float32
 
-from weighttraj.errors import CacheError
+from weighttraj.atomic import DRAFT, replacing
+from weighttraj.errors import CacheError, WeightTrajError
 from weighttraj.format import Run
-from weighttraj.format.objects import sync
 
 VARIABLE = "WEIGHTTRAJ_CACHE"
 """Environment variable that names the cache's folder."""
 
 _ENTRY = re.compile(r"([0-9a-f])[0-9a-f]{63}\.npy")
-_DRAFT = re.compile(r"\.([0-9a-f])[0-9a-f]{63}\.[0-9a-f]{16}\.draft")
+_DRAFT = re.compile(r"\.([0-9a-f])[0-9a-f]{63}(?:\.npy)?\.[0-9a-f]{16}\.draft")
 _DIGITS = "0123456789abcdef"
 
 
@@ -88,24 +87,12 @@ class CachedWeights:
 
     def _make(self, path: Path) -> None:
         """Decode the run into a draft, see it on the disk, and rename it; the lock is held."""
-        for old in path.parent.glob(f".{self.key}.*.draft"):  # of a process that was killed
-            with _told(path.parent):
+        with _told(path.parent):
+            for old in path.parent.glob(f".{self.key}.*{DRAFT}"):  # of a process that was killed
                 old.unlink()
-        draft = path.with_name(f".{self.key}.{secrets.token_hex(8)}.draft")
-        try:
-            with _told(path.parent):
-                file = draft.open("xb", buffering=0)
-            with file:
+            with replacing(path) as file:
                 for piece in self._pieces():
-                    with _told(path.parent):
-                        _write(file, piece)
-                with _told(path.parent):
-                    os.fsync(file.fileno())
-            with _told(path.parent):
-                draft.replace(path)
-                sync(path.parent)
-        finally:
-            draft.unlink(missing_ok=True)
+                    file.write(piece)
 
     def _pieces(self) -> Iterator[memoryview]:
         """The bytes of the entry; rows are read from the run, and so checked, piece by piece."""
@@ -212,17 +199,14 @@ def _header(shape: tuple[int, int]) -> bytes:
     return text.getvalue()
 
 
-def _write(file: io.FileIO, piece: memoryview) -> None:
-    while piece:  # the system may take less than all: at most 2 GiB at a time
-        piece = piece[file.write(piece) :]
-
-
 @contextmanager
 def _told(folder: Path) -> Iterator[None]:
     """Errors of the cache's own files, as one that says how to move it."""
     try:
         yield
     except OSError as error:
+        if isinstance(error, WeightTrajError):  # of the run that is read meanwhile
+            raise
         raise CacheError(
             "decoded runs cannot be kept in the cache",
             expected="a folder that can be written, on a disk with space",

@@ -17,9 +17,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
 from weighttraj import environments
+from weighttraj.atomic import appearing
 from weighttraj.errors import CollectError, PolicyError
 from weighttraj.format import Run
-from weighttraj.format.export import appearing
 from weighttraj.format.reader import NormStats
 from weighttraj.policies.policy import load_policy
 from weighttraj.policies.rollout import env_of

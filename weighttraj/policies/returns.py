@@ -11,16 +11,16 @@ import contextlib
 import importlib.metadata
 import json
 import math
-import os
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -30,12 +30,13 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from weighttraj.atomic import appending, lock_of, refuse_link, replace_file
 from weighttraj.engine import Engine, Tell, engine_of
 from weighttraj.errors import PolicyError, StoreLockedError
 from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, store_returns
 from weighttraj.format.catalog import DATASET, MANIFEST, read_dataset_info
 from weighttraj.format.integrity import seal, unseal
-from weighttraj.format.objects import replace_file
+from weighttraj.format.objects import MAX_DOCUMENT_BYTES
 from weighttraj.format.storage import PACKED
 from weighttraj.learning import learning_phase
 from weighttraj.policies.batch import load_policies
@@ -43,6 +44,7 @@ from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 from weighttraj.policies.simulators import GymnasiumSimulator
 from weighttraj.progress import LoggedProgress
 from weighttraj.remote.address import here
+from weighttraj.text import printable
 
 Mode = Literal["deterministic", "sampled"]
 
@@ -165,7 +167,7 @@ def fill_returns(
     home = owner or path.parent
     with engine_of(workers, scheduler, imports) as engine, _only_one((owner or path).resolve()):
         runs = _finished(open_dataset(path), console)
-        works = [_Work(run, home / ".returns", config, replace=replace) for run in runs]
+        works = [_Work(run, home, config, replace=replace) for run in runs]
         todo = [work for work in works if work.missing or work.unsaved]
         _say_broken(works, console)
         works = todo
@@ -205,16 +207,16 @@ class _Work:
 
     Args:
         run: the run.
-        folder: of the journals.
+        dataset: folder of the data set.
         config: the settings.
         replace: forget returns of another evaluation.
     """
 
-    def __init__(self, run: Run, folder: Path, config: ReturnsConfig, *, replace: bool) -> None:
+    def __init__(self, run: Run, dataset: Path, config: ReturnsConfig, *, replace: bool) -> None:
         self.run, self.config = run, config
         with Evaluator(env_of(run), episodes=1) as evaluator:
             self.evaluation = config.evaluation(evaluator.simulator)
-        self._journal = _Journal(folder / f"{run.id}.jsonl", self._header())
+        self._journal = _Journal(dataset, f"{run.id}.jsonl", self._header())
         self._finite: dict[int, bool] = {}
         self.played = self._stored(replace=replace) | self._journal.rows
         self.unsaved = len(self._journal.rows)
@@ -334,51 +336,81 @@ class _Journal:
     A line that a kill cut short, or that is damaged, is dropped, and what follows it.
 
     Args:
-        path: the file.
+        dataset: folder of the data set. It may be a stranger's: no part of the path is a link.
+        name: of the file.
         header: its first line; a journal with another one is begun anew.
+
+    Raises:
+        FormatError: the journal, or its folder, is a link.
     """
 
-    def __init__(self, path: Path, header: dict[str, Any]) -> None:
-        self._path, self._header = path, header
-        self.rows = self._read(header)
+    def __init__(self, dataset: Path, name: str, header: dict[str, Any]) -> None:
+        self._root, self._header = dataset, header
+        self._path = refuse_link(dataset / ".returns" / name, dataset)
+        self.rows = self._read()
 
     def begin(self) -> None:
         """Write it anew with the lines that hold."""
-        self._path.parent.mkdir(exist_ok=True)
-        replace_file(self._path, _line(self._header).encode())
+        replace_file(self._path, _line(self._header).encode(), root=self._root)
         self.append(self.rows)
 
-    def _read(self, header: dict[str, Any]) -> _Played:
+    def _read(self) -> _Played:
         if not self._path.is_file():
             return {}
         rows: _Played = {}
-        first, *lines = self._path.read_text(errors="replace").splitlines(keepends=True) or [""]
-        if first != _line(header):
-            return {}
-        for line in lines:
-            text = line.partition(" ")[2].removesuffix("\n")
-            if line != _crc(text):  # what follows a damaged line is played again
-                break
-            entry = json.loads(text)
-            returns = np.array([np.nan if x is None else x for x in entry["returns"]])
-            rows[entry["t"]] = (returns, np.array(entry["lengths"], np.int64))
+        first = _line(self._header).encode()
+        with self._path.open("rb") as file:
+            if file.readline(len(first)) != first:
+                return {}
+            while line := file.readline(MAX_DOCUMENT_BYTES):
+                entry = _entry(line)
+                if entry is None or not self._fits(entry):
+                    break  # what follows a damaged line is played again
+                returns = np.array([np.nan if x is None else x for x in entry.returns])
+                rows[entry.t] = (returns, np.array(entry.lengths, np.int64))
         return rows
+
+    def _fits(self, entry: _Entry) -> bool:
+        """Whether a line is of a snapshot of the run, and has a column for each episode."""
+        episodes = len(self._header["seeds"])
+        columns = len(entry.returns) == len(entry.lengths) == episodes
+        return columns and 0 <= entry.t < self._header["snapshots"]
 
     def append(self, rows: _Played) -> None:
         """Write lines; when this returns they survive a power cut."""
-        with self._path.open("a") as file:
+        with appending(self._path, root=self._root) as file:
             for row, (returns, lengths) in rows.items():
                 numbers = [None if np.isnan(x) else float(x) for x in returns]
                 entry = {"t": row, "returns": numbers, "lengths": lengths.tolist()}
-                file.write(_line(entry))
-            file.flush()
-            os.fsync(file.fileno())
+                file.write(_line(entry).encode())
 
     def remove(self) -> None:
         """Remove it, and the folder if no other journal is in it."""
         self._path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self._path.parent.rmdir()
+
+
+class _Entry(msgspec.Struct):
+    """One line of a journal."""
+
+    t: int
+    """The snapshot."""
+    returns: list[float | None]
+    """Return of each episode; None: the simulation became unstable."""
+    lengths: list[Annotated[int, msgspec.Meta(ge=-1, lt=2**31)]]
+    """Steps of each episode."""
+
+
+def _entry(line: bytes) -> _Entry | None:
+    """Parse a line of a journal; None: it is damaged."""
+    checksum, _, text = line.removesuffix(b"\n").partition(b" ")
+    if checksum != f"{zlib.crc32(text):08x}".encode() or not line.endswith(b"\n"):
+        return None
+    try:
+        return msgspec.json.decode(text, type=_Entry)
+    except (msgspec.DecodeError, RecursionError):
+        return None
 
 
 def _line(entry: dict[str, Any]) -> str:
@@ -417,7 +449,8 @@ def _say_broken(works: Sequence[_Work], console: Console) -> None:
 def _play(works: Sequence[_Work], engine: Engine, console: Console) -> None:
     """Play all tasks of all runs."""
     if slow := sorted({env_of(work.run).id for work in works if _is_slow(work)}):
-        console.print(f"{', '.join(slow)}: no batched physics, so Gymnasium's own loop, slowly")
+        names = printable(", ".join(slow))  # ids of environments, a stranger's perhaps
+        console.print(f"{names}: no batched physics, so Gymnasium's own loop, slowly", markup=False)
     for work in works:
         work.begin()
     columns = (
@@ -478,7 +511,7 @@ def _seldom(tell: Tell) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def _only_one(path: Path) -> Iterator[None]:
-    lock = FileLock(path.with_name(f".{path.name}.lock"))  # as who collects into it
+    lock = lock_of(path.with_name(f".{path.name}.lock"))  # as who collects into it
     try:
         lock.acquire(timeout=0)
     except Timeout as error:

@@ -21,11 +21,12 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from rich.console import Console
 
+from weighttraj.atomic import replace_file
 from weighttraj.errors import FormatError, WeightTrajError
-from weighttraj.format.objects import MAX_NAME, read_plain, replace_file
+from weighttraj.format.objects import MAX_NAME, read_plain
 from weighttraj.publish import figures
 from weighttraj.publish.curves import KINDS, curves
-from weighttraj.publish.report import MARK, refuse_foreign, report
+from weighttraj.publish.report import MARK, refuse_foreign, report, shown
 from weighttraj.publish.source import Source, facts, lead, open_source
 from weighttraj.publish.svg import Picture
 
@@ -264,6 +265,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
+        finalize=shown,
     )
 
 

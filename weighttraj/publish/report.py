@@ -12,9 +12,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from weighttraj.atomic import refuse_existing, replace_file
 from weighttraj.errors import StoreExistsError, WeightTrajError, missing_extra
 from weighttraj.format import Run
-from weighttraj.format.objects import refuse_existing, replace_file
 from weighttraj.progress import LoggedProgress
 from weighttraj.publish import figures
 from weighttraj.publish.curves import (
@@ -37,6 +37,7 @@ from weighttraj.publish.source import (
 )
 from weighttraj.publish.svg import Picture, power
 from weighttraj.publish.walk import Walk, rank_for, walk
+from weighttraj.text import printable
 
 MARK = '<meta name="generator" content="weighttraj report">'
 """Stands at the top of every page that this module writes, and lets it be written again."""
@@ -140,6 +141,7 @@ def _page(source: Source, *, film: bool, seed: int, progress: Progress) -> str:
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.undefined = jinja2.StrictUndefined
+    environment.finalize = shown
     return environment.get_template("report.html.j2").render(
         mark=MARK,
         source=source,
@@ -162,6 +164,11 @@ def _broken(run: Run, walk: Walk) -> str:
         f"or infinite, the first at t = {walk.broken[0]:,}. They are left out of the figures of "
         "steps, spectrum and path."
     )
+
+
+def shown(value: Any) -> Any:
+    """What a page shows of a value: text that may be a stranger's, without control characters."""
+    return printable(value, lines=True) if type(value) is str else value
 
 
 def _returns(runs: Sequence[Run]) -> dict[str, Any]:
@@ -308,4 +315,4 @@ def _film(run: Run, seed: int, progress: Progress, task: Any) -> tuple[dict[str,
     }, ""
 
 
-__all__ = ["MARK", "report"]
+__all__ = ["MARK", "report", "shown"]

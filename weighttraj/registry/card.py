@@ -17,13 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from weighttraj.atomic import replace_file
 from weighttraj.errors import RegistryError
 from weighttraj.format import Algorithm, Dataset, open_dataset
 from weighttraj.format.catalog import MANIFEST, check_file_names, write_manifest
 from weighttraj.format.locate import locate
-from weighttraj.format.objects import read_plain, replace_file
+from weighttraj.format.objects import read_plain
 from weighttraj.format.tables import RUNS, SNAPSHOTS
 from weighttraj.registry.croissant import CROISSANT, citation, croissant
+from weighttraj.text import markdown, printable, yaml
 
 CARD = "README.md"
 START, END = "<!-- facts, {}: rewrite with `weighttraj card` -->", "<!-- end of facts -->"
@@ -65,7 +67,7 @@ def write_card(path: str | Path) -> Path:
     written = {CARD: refreshed(text, dataset), CROISSANT: croissant(dataset)}
     (folder / MANIFEST).unlink(missing_ok=True)  # from here on it would be wrong
     for name, content in written.items():
-        replace_file(folder / name, content.encode())
+        replace_file(folder / name, content.encode(), root=folder)
     write_manifest(folder)
     return card
 
@@ -167,11 +169,14 @@ def _front_matter(dataset: Dataset) -> str:
     environments = sorted({run.info.env.id for run in dataset if run.info.env})
     tags = ["reinforcement-learning", "weight-space-learning", "policy-weight-trajectories"]
     lines = [
-        f"license: {dataset.info.licence.lower()}",
+        f"license: {yaml(dataset.info.licence.lower())}",
         f"pretty_name: {json.dumps(dataset.info.id)}",
         "task_categories:\n- reinforcement-learning",
         f"size_categories:\n- {size}",
-        "tags:\n" + "\n".join(f"- {json.dumps(tag)}" for tag in [*tags, *environments]),
+        "tags:\n"
+        + "\n".join(
+            f"- {json.dumps(printable(tag), ensure_ascii=False)}" for tag in [*tags, *environments]
+        ),
         "configs:",
         f"- config_name: snapshots\n  data_files: {SNAPSHOTS}\n  default: true",
         f"- config_name: runs\n  data_files: {RUNS}",
@@ -186,7 +191,8 @@ def _summary(dataset: Dataset) -> str:
     cadence = run.info.cadence
     every = f", one every {cadence.every} gradient steps" if cadence else ""
     return (
-        f"The weights of policies while {', '.join(names)} trains them on {', '.join(env)}: "
+        f"The weights of policies while {markdown(', '.join(names))} trains them on "
+        f"{markdown(', '.join(env))}: "
         f"{len(dataset):,} runs of {_range(len(r) for r in dataset)} snapshots{every}, of "
         f"{_range(r.layout.size for r in dataset)} parameters each."
     )
@@ -213,7 +219,7 @@ def _composition(dataset: Dataset) -> str:
     lines = [
         f"- runs: {', '.join(f'{count} {name}' for name, count in parts.items())}",
         f"- policy: {run.info.policy.kind}, {run.info.policy.mode} head, "
-        f"{run.info.policy.activation or 'other'} units: {' x '.join(hidden)}",
+        f"{markdown(run.info.policy.activation or 'other')} units: {' x '.join(hidden)}",
         "",
         f"| array of `{run.id}` | shape | type |",
         "|---|---|---|",
@@ -250,20 +256,20 @@ def _collection(dataset: Dataset) -> str:
     lines = []
     for packages in sorted(provenances):
         said = ", ".join(f"{name} {version}" for name, version in json.loads(packages).items())
-        lines.append(f"- made with {said or 'versions that are not said'}")
+        lines.append(f"- made with {markdown(said) or 'versions that are not said'}")
     provenance = run.info.provenance
     machine = ", ".join(filter(None, (provenance.platform, provenance.cpu)))
     if machine:
-        lines.append(f"- on {machine}")
+        lines.append(f"- on {markdown(machine)}")
     seeds = [r.info.seed for r in dataset if r.info.seed is not None]
     if seeds:
         lines.append(f"- seeds {_seeds(seeds)}")
     match run.info.algorithm:
         case Algorithm(name=name, library=library, hyperparameters=settings):
-            of = f" of {library}" if library else ""
-            lines += ["", f"Settings of {name}{of}, `{run.id}`:", ""]
+            of = f" of {markdown(library)}" if library else ""
+            lines += ["", f"Settings of {markdown(name)}{of}, `{run.id}`:", ""]
             lines += ["| setting | value |", "|---|---|"]
-            lines += [f"| {k} | {_value(v)} |" for k, v in settings.items()]
+            lines += [f"| {markdown(k)} | {_value(v)} |" for k, v in settings.items()]
     return "\n".join(lines)
 
 
@@ -271,8 +277,8 @@ def _distribution(dataset: Dataset) -> str:
     runs = sorted(entry.path for entry in dataset.info.runs)
     return "\n".join(
         [
-            f"- licence: {dataset.info.licence}",
-            f"- version {dataset.info.version} of the data, version "
+            f"- licence: {markdown(dataset.info.licence)}",
+            f"- version {markdown(dataset.info.version)} of the data, version "
             f"{dataset.info.format_version} of the format",
             f"- {len(runs)} runs as Zarr v3 groups, `{runs[0]}` and so on; `{SNAPSHOTS}`, `{RUNS}`",
             f"- `{MANIFEST}` has the hash of every file",
@@ -313,7 +319,7 @@ def _value(value: Any) -> str:
         same = all(pair[1] == first for pair in value)
         return f"{first:.6g}" if same else f"{first:.6g} at the start, {last:.6g} at the end"
     text = value if isinstance(value, str) else json.dumps(value)
-    return (text if len(text) <= 60 else f"{text[:57]}...").replace("|", "\\|")
+    return markdown(text if len(text) <= 60 else f"{text[:57]}...")
 
 
 def _is_schedule(value: Any) -> bool:
@@ -322,6 +328,7 @@ def _is_schedule(value: Any) -> bool:
         isinstance(value, list)
         and len(value) > 1
         and all(isinstance(pair, list) and len(pair) == 2 for pair in value)
+        and all(isinstance(number, int | float) for pair in value for number in pair)
     )
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
-from weighttraj.errors import missing_extra
 from weighttraj.format import Dataset
-from weighttraj.format.tables import RUNS, SNAPSHOTS
+from weighttraj.format.tables import RUNS, SNAPSHOTS, read_schema
+from weighttraj.text import printable
 
 CROISSANT = "croissant.json"
 
@@ -98,7 +99,9 @@ def citation(dataset: Dataset) -> str:
         "version": dataset.info.version,
         "year": created[:4],
     }
-    lines = [f"  {name} = {{{value}}}" for name, value in fields.items() if value]
+    plain = {name: re.sub(r"[\\{}`]", "", printable(value)) for name, value in fields.items()}
+    plain["title"] = fields["title"]  # an id has no such characters
+    lines = [f"  {name} = {{{value}}}" for name, value in plain.items() if value]
     key = dataset.info.id.replace(".", "-")
     return f"@misc{{{key},\n" + ",\n".join(lines) + "\n}"
 
@@ -117,10 +120,6 @@ def _file(folder: Path, key: str, name: str) -> dict[str, Any]:
 
 
 def _records(folder: Path, key: str, name: str) -> dict[str, Any]:
-    try:
-        import pyarrow.parquet as pq
-    except ModuleNotFoundError as error:
-        raise missing_extra("pyarrow", "files") from error
     return {
         "@type": "cr:RecordSet",
         "@id": key,
@@ -137,7 +136,7 @@ def _records(folder: Path, key: str, name: str) -> dict[str, Any]:
                     "extract": {"column": column.name},
                 },
             }
-            for column in pq.read_schema(folder / name)
+            for column in read_schema(folder, name)
         ],
     }
 

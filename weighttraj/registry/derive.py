@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 
-from weighttraj.errors import FormatError, RegistryError
+from weighttraj.atomic import appearing
+from weighttraj.errors import FormatError, RegistryError, WeightTrajError
 from weighttraj.format import (
     Dataset,
     DatasetInfo,
@@ -26,7 +26,6 @@ from weighttraj.format import (
     seal,
 )
 from weighttraj.format.catalog import write_dataset_info
-from weighttraj.format.objects import refuse_existing
 from weighttraj.format.packing import copy_packed
 from weighttraj.format.storage import PACKED
 from weighttraj.progress import LoggedProgress
@@ -256,32 +255,30 @@ def _write(
     console: Console | None,
 ) -> Dataset:
     """Copy the runs beside the place, then rename: half a data set has a hidden name."""
-    refuse_existing(out)
     console = console or Console(quiet=True)
-    draft = out.with_name(f".{out.name}.{os.getpid()}.draft")
     columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn())
     try:
-        (draft / "runs").mkdir(parents=True)
-        entries = []
-        with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
-            for new, (run, part) in progress.track(chosen.items()):
-                entry = RunEntry(
-                    id=new, path=f"runs/{new}.zarr{PACKED}", seed=run.info.seed, split=part
-                )
-                _copy(run, draft / entry.path, new)
-                entries.append(entry)
-        write_dataset_info(draft, replace(info, runs=tuple(entries), status="complete"))
-        seal(draft)
-        draft.rename(out)
+        with appearing(out) as draft:
+            (draft / "runs").mkdir(parents=True)
+            entries = []
+            with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
+                for new, (run, part) in progress.track(chosen.items()):
+                    entry = RunEntry(
+                        id=new, path=f"runs/{new}.zarr{PACKED}", seed=run.info.seed, split=part
+                    )
+                    _copy(run, draft / entry.path, new)
+                    entries.append(entry)
+            write_dataset_info(draft, replace(info, runs=tuple(entries), status="complete"))
+            seal(draft)
     except OSError as error:
+        if isinstance(error, WeightTrajError):
+            raise
         raise FormatError(
             "the data set could not be written; nothing was left behind",
             got=error,
             where=out,
             do="make room, or choose another place, and give the command again",
         ) from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
     return open_dataset(out)
 
 

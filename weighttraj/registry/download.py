@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import re
 import shutil
 from collections.abc import Collection, Iterator
@@ -24,6 +25,7 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
+from weighttraj.atomic import refuse_existing, replace_file
 from weighttraj.errors import DamageError, FormatError, RegistryError, RemoteError, StoreLockedError
 from weighttraj.format import Dataset, RunEntry, open_dataset, seal
 from weighttraj.format.catalog import (
@@ -33,8 +35,7 @@ from weighttraj.format.catalog import (
     parse_manifest,
     write_dataset_info,
 )
-from weighttraj.format.locate import folders
-from weighttraj.format.objects import refuse_existing, replace_file
+from weighttraj.format.locate import VARIABLE, folders
 from weighttraj.format.packing import cut
 from weighttraj.format.storage import PACKED
 from weighttraj.progress import LoggedProgress
@@ -174,7 +175,16 @@ def download_folder(
 
 
 def home() -> Path:
-    """Where data sets are put that are downloaded."""
+    """Where data sets are put that are downloaded.
+
+    Raises:
+        RegistryError: no folder is named for them, and the user has no home.
+    """
+    if not os.environ.get(VARIABLE) and os.path.expanduser("~") == "~":
+        raise RegistryError(
+            "there is no home folder to keep data sets in",
+            do=f"set {VARIABLE} to a folder, or give --out",
+        )
     return folders()[0]
 
 

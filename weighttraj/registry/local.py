@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -108,7 +108,7 @@ def delete(name: str) -> Path:
             do="remove what you mean yourself",
         )
     open_dataset(path)  # a folder that only looks like a data set is left alone
-    hidden = path.with_name(f".{path.name}.{os.getpid()}.deleted")
+    hidden = path.with_name(f".{path.name}.{secrets.token_hex(8)}.deleted")
     path.rename(hidden)
     shutil.rmtree(hidden)
     return path

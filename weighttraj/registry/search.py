@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from weighttraj.errors import DamageError, RegistryError, WeightTrajError, missing_extra
+from weighttraj.errors import RegistryError, WeightTrajError, missing_extra
 from weighttraj.format import open_dataset
-from weighttraj.format.tables import RUNS, run_row
+from weighttraj.format.tables import HYPERPARAMETER, RUN_COLUMNS, RUNS, read_table, runs_table
 from weighttraj.registry.local import LocalDataset, local_datasets
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def search(
     tables = []
     for dataset in local_datasets() if datasets is None else datasets:
         try:
-            table = _table(dataset.path)
+            table = _table(dataset)
         except WeightTrajError as error:
             if damaged is None:
                 raise
@@ -77,22 +77,15 @@ def search(
     return rows.loc[fits].reset_index(drop=True)
 
 
-def _table(path: Path) -> pd.DataFrame:
-    """The runs of a data set."""
-    import pandas as pd
-
-    file = path / RUNS
-    if not file.is_file():  # a data set that is still being collected has no table yet
-        return pd.DataFrame([run_row(run) for run in open_dataset(path)])
-    try:
-        return pd.read_parquet(file)
-    except Exception as error:  # pyarrow's and pandas', which are of every kind
-        raise DamageError(
-            "the table of a data set's runs cannot be read",
-            got=error,
-            where=file,
-            do="restore it from a copy, or give the data set another place",
-        ) from error
+def _table(dataset: LocalDataset) -> pd.DataFrame:
+    """The runs of a data set. Columns that the format does not have are left out."""
+    if not os.path.lexists(dataset.path / RUNS):  # one that is still being collected has no table
+        table = runs_table(open_dataset(dataset.path))
+    else:
+        table = read_table(dataset.path, RUNS, len(dataset.info.runs))
+    known = [c for c in table.column_names if c in RUN_COLUMNS or c.startswith(HYPERPARAMETER)]
+    frame: pd.DataFrame = table.select(known).to_pandas()
+    return frame
 
 
 __all__ = ["search"]
