@@ -424,7 +424,7 @@ def test_a_recipe_without_seeds_collects_nothing(tmp_path: Path) -> None:
 
 
 def test_impossible_settings_are_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="no such runs"):
+    with pytest.raises(RecipeError, match="impossible values"):
         collect(replace(one_seed(), store=Store(every=10**6)), tmp_path / "dataset")
     assert list(tmp_path.iterdir()) == []
 
