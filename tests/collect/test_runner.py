@@ -476,7 +476,8 @@ def test_no_workers_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_environment_fails_each_run_clearly(tmp_path: Path) -> None:
+def test_an_unknown_environment_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     recipe = replace(one_seed(), ppo=replace(SMALL, env_id="NoSuchEnv-v0"))
-    with pytest.raises(CollectError, match=r"(?s)seed 0: the environment cannot be made.*goes on"):
+    with pytest.raises(RecipeError, match=r"env_id = 'NoSuchEnv-v0': Environment .* doesn't exist"):
         collect(recipe, tmp_path / "dataset", workers=1)
+    assert list(tmp_path.iterdir()) == []

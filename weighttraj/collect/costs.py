@@ -38,7 +38,7 @@ def measured(folder: Path, finished: Callable[[], Sequence[int]]) -> Iterator[No
             "cpu_s": round(_cpu_seconds() - cpu, 1),
             "wall_s": round(time.monotonic() - wall, 1),
         }
-        if folder.is_dir() and (stopped or line["seeds"]):
+        if (folder / "dataset.json").is_file() and (stopped or line["seeds"]):
             with appending(folder / COSTS, root=folder) as file:
                 file.write(f"{json.dumps(line)}\n".encode())
 
