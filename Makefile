@@ -21,7 +21,7 @@ demo: setup ## open the released data, collect a run beside it, train TIPL, judg
 	$(BIN)/weighttraj collect datasets/demo/recipe.toml --out $(DEMO)/live
 	$(BIN)/weighttraj returns $(DEMO)/live --every 25 --episodes 5
 	$(BIN)/weighttraj report $(DEMO)/live --out $(DEMO)/live.html
-	$(BIN)/tipl train --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/tipl --n-batches 500 --warmup 100 --save-every 100
+	$(BIN)/tipl train tipl --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/tipl --n-batches 500 --warmup 100 --save-every 100
 	$(BIN)/tipl evaluate $(DEMO)/tipl --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/report --quick --workers 2
 
 test: setup ## run the tests
@@ -31,6 +31,7 @@ lint: setup ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 docs: setup ## build the pages as one site, docs/_build/index.html
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . docs/_build
@@ -52,8 +53,8 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python tests/benchmarks/results.py
 
 results: setup ## judge the zoo and the baselines, write docs/results.md: two hours
-	$(BIN)/tipl fit $(RELEASED) --out data/results/ladder
-	for along in $(RIVALS); do $(BIN)/tipl train-drift --along $$along --data $(RELEASED) --out data/results/further/$$(basename $$along)-further --amplitudes 0.25 0.5 1 1.5 2 3 4 6 8 || exit 1; done
+	$(BIN)/tipl train baselines --data $(RELEASED) --out data/results/ladder
+	for along in $(RIVALS); do $(BIN)/tipl train scaled --along $$along --data $(RELEASED) --out data/results/further/$$(basename $$along)-further --amplitudes 0.25 0.5 1 1.5 2 3 4 6 8 || exit 1; done
 	$(BIN)/tipl evaluate tipl-inverted-pendulum-v4 tipl-gate-inverted-pendulum-v4 tipl-drift-inverted-pendulum-v4 tipl-causal-inverted-pendulum-v4 data/results/ladder/* data/results/further/* --data $(RELEASED) --out data/results/full --return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1 --workers 2
 	cp data/results/full/results.json docs/results/$(RELEASED).json
 	$(BIN)/tipl report docs/results/$(RELEASED).json --into docs/results.md

@@ -21,7 +21,7 @@ PROGRAMS: dict[str, Callable[[], None]] = {
     "tipl": tipl.cli.main,
 }
 
-LONG = ("tipl evaluate", "tipl check", "tipl fit")
+LONG = ("tipl evaluate", "tipl check", "tipl train baselines")
 """Commands for which the checks of shapes, here, take longer than the start of a process."""
 QUICKER = (
     "--quick --starts 50 --function-starts 10 --learning-starts 1 --plateau-starts 0"

@@ -118,7 +118,7 @@ def background(command: str) -> Iterator[subprocess.Popen[str]]:
 def test_evaluate(reader: Path) -> None:
     names = run_page(DOCS / "evaluate.md", {"--quick": QUICKER, "--episodes 5": "--episodes 1"})
     assert names["after"] > names["before"] + 100
-    assert "half-step" in names["results"]["forecasters"]
+    assert "half-step" in names["results"].forecasters
 
 
 def test_the_page_of_what_is_supported_says_what_was_tried(

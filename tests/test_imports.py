@@ -320,174 +320,7 @@ ALLOWED = {
         "later weighttraj.publish.gallery",
         "later weighttraj.publish.report",
     ],
-    "weighttraj": [FORMAT, "weighttraj.remote"],
-    "tipl.errors": ["weighttraj.errors"],
-    "tipl.settings": ["weighttraj.errors"],
-    "tipl.representation": ["tipl.errors", "tipl.representation", "door weighttraj"],
-    "tipl.models": ["tipl.models"],
-    "tipl.tokens": ["tipl.errors", "tipl.representation"],
-    "tipl.forecast": [
-        "tipl.errors",
-        "tipl.models",
-        "tipl.representation",
-        "tipl.tokens",
-        "door weighttraj",
-        "later tipl.zoo.remote",
-    ],
-    "tipl.baselines": [
-        "tipl.settings",
-        "tipl.baselines",
-        "tipl.errors",
-        "tipl.forecast",
-        "tipl.representation",
-        "door weighttraj",
-        "tipl.threads",
-    ],
-    "tipl.gate": [
-        "tipl.settings",
-        "tipl.baselines.files",
-        "tipl.baselines.horizons",
-        "tipl.baselines.trajectory",
-        "tipl.errors",
-        "tipl.forecast",
-        "tipl.gate",
-        "tipl.models",
-        "tipl.learn",
-        "tipl.structure",
-        "door weighttraj",
-        "tipl.threads",
-    ],
-    "tipl.drift": [
-        "tipl.settings",
-        "tipl.threads",
-        "weighttraj.progress",
-        "tipl.baselines.files",
-        "tipl.baselines.horizons",
-        "tipl.drift",
-        "tipl.errors",
-        "tipl.evaluation",
-        "tipl.forecast",
-        "tipl.gate",
-        "tipl.models",
-        "later tipl.zoo.lookup",
-        "tipl.prepare",
-        "tipl.state",
-        "door weighttraj",
-    ],
-    "tipl.causal": [
-        "tipl.settings",
-        "tipl.errors",
-        "tipl.baselines.files",
-        "tipl.baselines.horizons",
-        "tipl.baselines.trajectory",
-        "tipl.causal",
-        "tipl.forecast",
-        "tipl.structure",
-        "tipl.learn",
-        "tipl.models",
-        "tipl.representation",
-        "door weighttraj",
-        "tipl.threads",
-    ],
-    "tipl.structure": ["tipl.models.gate", "door weighttraj"],
-    "tipl.learn": [
-        "tipl.settings",
-        "tipl.threads",
-        "weighttraj.progress",
-        "tipl.baselines.horizons",
-        "tipl.errors",
-        "tipl.prepare",
-        "tipl.progress",
-        "tipl.state",
-        "door weighttraj",
-    ],
-    "tipl.checks": ["tipl.errors", "tipl.forecast", "door weighttraj"],
-    "tipl.refit": [
-        "tipl.settings",
-        "tipl.errors",
-        "tipl.baselines",
-        "tipl.checks",
-        "tipl.evaluation.parts",
-        "tipl.causal",
-        "tipl.drift",
-        "tipl.forecast",
-        "tipl.gate",
-        "tipl.train",
-        "door weighttraj",
-        "door weighttraj.format",
-        "weighttraj.format.catalog",
-    ],
-    "tipl.prepare": [
-        "tipl.errors",
-        "tipl.representation",
-        "tipl.tokens",
-        "door weighttraj",
-    ],
-    "tipl.distributed": ["tipl.errors"],
-    "tipl.state": ["weighttraj.atomic", "tipl.errors"],
-    "tipl.progress": ["weighttraj.progress"],
-    "tipl.threads": [],
-    "tipl.step": ["tipl.distributed", "tipl.errors", "tipl.models", "tipl.tokens"],
-    "tipl.train": [
-        "tipl.settings",
-        "tipl.threads",
-        "tipl.distributed",
-        "tipl.errors",
-        "tipl.forecast",
-        "tipl.models",
-        "tipl.prepare",
-        "tipl.progress",
-        "tipl.state",
-        "tipl.step",
-        "tipl.tokens",
-    ],
-    "tipl.report": ["tipl.errors", "tipl.report"],
-    "tipl.evaluation": [
-        "weighttraj.atomic",
-        "tipl.settings",
-        "tipl.threads",
-        "weighttraj.progress",
-        "tipl.baselines",
-        "tipl.errors",
-        "tipl.evaluation",
-        "tipl.forecast",
-        "tipl.report",
-        "door weighttraj",
-        "weighttraj.engine",
-        "weighttraj.policies",
-    ],
-    "tipl.zoo.remote": [
-        "tipl.errors",
-        "tipl.forecast",
-        "tipl.zoo",
-        "weighttraj.format.catalog",
-        "weighttraj.registry.download",
-        "weighttraj.registry.upload",
-        "weighttraj.remote",
-    ],
-    "tipl.zoo.lookup": [
-        "tipl.baselines",
-        "tipl.errors",
-        "tipl.causal",
-        "tipl.drift",
-        "tipl.forecast",
-        "tipl.gate",
-        "later tipl.zoo.remote",
-    ],
-    "tipl.zoo": [
-        "tipl.baselines",
-        "tipl.errors",
-        "tipl.evaluation.parts",
-        "tipl.causal",
-        "tipl.drift",
-        "tipl.forecast",
-        "tipl.gate",
-        "tipl.report",
-        "tipl.zoo",
-        "door weighttraj",
-    ],
-    "tipl.cli": ["tipl", "door weighttraj", "weighttraj.errors", REMOTE, "weighttraj.terminal"],
-    "tipl": ["tipl", "weighttraj.errors"],
+    "weighttraj": [f"later {FORMAT}", "later weighttraj.remote"],
 }
 
 
@@ -536,7 +369,7 @@ def in_type_checking(tree: ast.Module, node: ast.AST) -> bool:
     return any(node in ast.walk(b) for b in blocks if ast.unparse(b.test) == "TYPE_CHECKING")
 
 
-FILES = sorted([*ROOT.glob("weighttraj/**/*.py"), *ROOT.glob("tipl/**/*.py")])
+FILES = sorted(ROOT.glob("weighttraj/**/*.py"))
 
 
 @pytest.mark.parametrize("path", FILES, ids=module_name)
@@ -553,9 +386,29 @@ def test_the_table_of_arrows_has_no_dead_lines() -> None:
         assert module in names, module
 
 
+def test_the_rooms_of_tipl_import_one_way() -> None:
+    """The contracts in pyproject.toml, imports inside functions included."""
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports as f; exit(f())"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stdout
+
+
 def run(code: str) -> str:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return done.stdout.strip()
+
+
+HEAVY_FOR_COMMANDS = ["torch", "zarr", "stable_baselines3", "mujoco", "matplotlib", "gymnasium"]
+
+
+@pytest.mark.parametrize("command", ["--help", "--version", "zoo", "train --help"])
+def test_a_list_of_models_or_commands_loads_nothing_heavy(command: str) -> None:
+    said = run(
+        f"import sys; sys.argv = ['tipl', *{command.split()}]\n"
+        "from tipl.cli import main; main()\n"
+        f"print([m for m in {HEAVY_FOR_COMMANDS} if m in sys.modules])"
+    )
+    assert said.endswith("[]"), said
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.pages import QUICKER, blocks, run_page
+from tipl.evaluation.results import read_results
 from tipl.report.markdown import places, render, rewrite
 from weighttraj.policies import evaluate
 
@@ -61,7 +61,7 @@ def test_the_numbers_come_from_their_files(page: Path, monkeypatch: pytest.Monke
         if not Path(source).exists():
             assert all(place.empty for place in places(text) if place.source == source), source
             continue
-        results = json.loads(Path(source).read_text())
+        results = read_results(Path(source))
         fresh = rewrite(text, "results", source, partial(render, results, Path(source)))
         assert fresh == text, f"run: tipl report {source} --into {page.relative_to(ROOT)}"
     for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):

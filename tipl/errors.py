@@ -23,3 +23,7 @@ class TrainError(WeightTrajError, ValueError):
 
 class EvaluateError(WeightTrajError, ValueError):
     """An evaluation that cannot be made."""
+
+
+class LeftOutWarning(UserWarning):
+    """A run was left out of a training or an evaluation; the message says which, and why."""

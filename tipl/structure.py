@@ -1,7 +1,7 @@
-"""What a run says beside its weights: which of them belong together, and when each snapshot is.
+"""What a run says beside its weights: which parameters belong together, and the time of snapshots.
 
-What networks of ours see of these is relative, so it is the same for a policy with another order
-of its hidden units.
+Our networks see relative quantities of these only, which are the same for a policy with its hidden
+units in another order.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tipl.models.gate import KINDS
 from weighttraj import ParamLayout, Run
+
+KINDS = ("input weight", "hidden weight", "output weight", "hidden bias", "output bias", "other")
+"""What a tensor is in a policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +36,7 @@ class Structure:
 
     @classmethod
     def of(cls, layout: ParamLayout) -> Structure:
-        """Of a policy's layout."""
+        """Return the structure of a policy's layout."""
         size = layout.size
         tensor, row, column = (np.zeros(size, np.int64) for _ in range(3))
         rows = columns = 0
@@ -55,22 +57,22 @@ class Structure:
         )
 
     def means(self, values: Float[Tensor, "any param"]) -> Float[Tensor, "any tensor"]:
-        """Means over the parameters of each tensor."""
+        """Return means over the parameters of each tensor."""
         return torch.stack([values[:, part].mean(1) for part in self.slices], dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """What is known of each snapshot's time."""
+    """Phase and learning rate of each snapshot."""
 
     phase: Int[np.ndarray, " time"]
-    """Part of its iteration that ends at a snapshot; -1: none."""
+    """Part of its iteration that ends at a snapshot; -1: unset."""
     rate: Float[np.ndarray, " time"]
-    """Learning rate over the first one; 1 where it is not known."""
+    """Learning rate over the first one; 1 where it is not recorded."""
 
     @classmethod
     def of(cls, run: Run) -> Clock:
-        """Of a run."""
+        """Return the times of a run."""
         rates = np.asarray(run.learning_rate, np.float64)
         known = rates[np.isfinite(rates)]
         first = known[0] if len(known) else 1.0

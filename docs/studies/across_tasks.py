@@ -24,11 +24,11 @@ from study import Study, parser
 
 import tipl
 import weighttraj as wt
-from tipl.baselines import Persistence
-from tipl.evaluation.statistics import Bootstrap, Interval, quotient
+from tipl.evaluation.statistics import Bootstrap, Cell, quotient
 from tipl.evaluation.weights import squared_errors
-from tipl.forecast import Forecaster
-from tipl.gate import GateTrainConfig, train_gate
+from tipl.forecaster import Forecaster
+from tipl.models.baselines import Persistence
+from tipl.models.gate import GateTrainConfig, train_gate
 from weighttraj.collect import collect, read_recipe
 from weighttraj.collect.recipe import Seeds
 from weighttraj.engine import Tell, engine_of
@@ -64,7 +64,8 @@ def collect_short(out: Path) -> list[Path]:
 
 def trainings(out: Path, short: list[Path], n_batches: int) -> dict[str, GateTrainConfig]:
     """What is trained, by what it learns from."""
-    config = partial(GateTrainConfig, n_batches=n_batches)
+    training = replace(GateTrainConfig.training, n_batches=n_batches)
+    config = partial(GateTrainConfig, training=training)
     return {
         "the four": config(data=tuple(short), out=out / "gate-four"),
         "InvertedPendulum and the four": config(data=(PENDULUM, *short), out=out / "gate-five"),
@@ -180,7 +181,7 @@ def _foreign(learnt_from: str, place: str) -> bool:
     return "the four" not in learnt_from
 
 
-def _told(cell: Interval, foreign: bool) -> str:
+def _told(cell: Cell, foreign: bool) -> str:
     value, low, high = (f"{cell[key]:.3f}" for key in ("value", "low", "high"))
     told = f"{value} [{low}, {high}]"
     return f"*{told}*" if foreign else told

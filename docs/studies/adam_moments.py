@@ -15,7 +15,8 @@ from pathlib import Path
 from study import Study, parser
 from variants import compare, table
 
-from tipl.gate import GateTrainConfig
+from tipl import change
+from tipl.models.gate import GateTrainConfig
 
 DATA = Path("data/inverted-pendulum-v4-ppo-adam")
 WHOLE = "weights alone"
@@ -24,9 +25,8 @@ WHOLE = "weights alone"
 def variants(data: Path, models: Path, n_batches: int) -> dict[str, GateTrainConfig]:
     """What is trained: each with two seeds."""
     return {
-        f"{name}{', another seed' if seed else ''}": GateTrainConfig(
-            data=(data,),
-            out=models / f"{'adam' if adam else 'weights'}-{seed}",
+        f"{name}{', another seed' if seed else ''}": change(
+            GateTrainConfig(data=(data,), out=models / f"{'adam' if adam else 'weights'}-{seed}"),
             n_batches=n_batches,
             seed=seed,
             adam=bool(adam),

@@ -15,8 +15,9 @@ from typing import get_args
 from study import Study, parser
 from variants import compare, table
 
-from tipl.gate import GateTrainConfig
-from tipl.models.gate import Input
+from tipl import change
+from tipl.models.gate import GateTrainConfig
+from tipl.models.gate.network import Input
 
 DATA = "inverted-pendulum-v4-ppo-v1"
 WHOLE, AGAIN = "all inputs", "all inputs, another seed"
@@ -27,9 +28,8 @@ def variants(models: Path, n_batches: int) -> dict[str, GateTrainConfig]:
 
     def config(name: str, seed: int, *without: Input) -> GateTrainConfig:
         out = models / name.replace(", ", "-").replace(" ", "-")
-        return GateTrainConfig(
-            data=(DATA,), out=out, n_batches=n_batches, seed=seed, without=without
-        )
+        config = GateTrainConfig(data=(DATA,), out=out)
+        return change(config, n_batches=n_batches, seed=seed, without=without)
 
     found = {WHOLE: config(WHOLE, 0), AGAIN: config(AGAIN, 1)}
     for name in get_args(Input):

@@ -18,7 +18,7 @@ from study import Study, parser
 import tipl
 import weighttraj as wt
 from tipl.evaluation.returns import Player, forecast_returns, true_returns
-from tipl.evaluation.statistics import Bootstrap, Interval, mean, ratio_of_sums
+from tipl.evaluation.statistics import Bootstrap, Cell, mean, ratio_of_sums
 
 FORECASTERS = (
     *("tipl-gate-half-cheetah-v4", "tipl-gate-inverted-pendulum-v4"),
@@ -97,7 +97,7 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join([*lines, "", told])
 
 
-def _told(cell: Interval, digits: int) -> str:
+def _told(cell: Cell, digits: int) -> str:
     value, low, high = (f"{cell[key]:.{digits}f}" for key in ("value", "low", "high"))
     return f"{value} [{low}, {high}]"
 

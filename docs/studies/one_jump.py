@@ -17,7 +17,7 @@ from study import Study, parser
 import tipl
 import weighttraj as wt
 from tipl.evaluation.returns import Player, forecast_returns, true_returns
-from tipl.evaluation.statistics import Bootstrap, Interval, mean
+from tipl.evaluation.statistics import Bootstrap, Cell, mean
 
 DATA = "inverted-pendulum-v4-ppo-v1"
 MODELS = ("tipl-gate", "tipl-drift", "tipl-causal", "tipl", "ar-20-phase")
@@ -81,7 +81,7 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join([*lines, "", told])
 
 
-def _told(cell: Interval) -> str:
+def _told(cell: Cell) -> str:
     return f"{cell['value']:.0f} [{cell['low']:.0f}, {cell['high']:.0f}]"
 
 

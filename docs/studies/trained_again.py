@@ -12,7 +12,6 @@ those that are here too. Writes the tables in trained_again.md, beside this file
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import subprocess
@@ -24,7 +23,9 @@ from typing import Any
 from study import Study, parser
 
 import tipl
-from tipl.evaluation.statistics import Interval
+from tipl.evaluation.results import Measure, Results, Scores, read_results
+from tipl.evaluation.statistics import Cell
+from tipl.report.scores import GAIN, SKILL, function_skill, row_at
 from tipl.zoo.metrics import read_metrics
 
 ROOT = Path(__file__).parents[2]
@@ -37,22 +38,20 @@ class Judging:
 
     options: str
     """As the models of the zoo were."""
-    figures: dict[str, tuple[Any, ...]]
-    """Where they stand in a result file, the horizon last."""
+    figures: dict[str, tuple[Measure, int]]
+    """What is read of a result file, and at which horizon."""
 
 
-SKILL = ("skill", "ratio_of_sums", "all")
-GAIN = ("gain", "held")
 JUDGED = {
     "inverted-pendulum-v4-ppo-v1": Judging(
         "--return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1",
-        {f"skill, h = {h}": (*SKILL, h) for h in (1, 10, 50)}
-        | {f"gain, h = {h}": (*GAIN, h) for h in (10, 50)},
+        {f"skill, h = {h}": (SKILL, h) for h in (1, 10, 50)}
+        | {f"gain, h = {h}": (GAIN, h) for h in (10, 50)},
     ),
     "half-cheetah-v4-ppo-v1": Judging(
         "--starts 60 --function-starts 12 --learning-starts 0 --plateau-starts 0",
-        {f"skill, h = {h}": (*SKILL, h) for h in (1, 10, 50, 200)}
-        | {"function skill, h = 10": ("function_skill", "all", 10)},
+        {f"skill, h = {h}": (SKILL, h) for h in (1, 10, 50, 200)}
+        | {"function skill, h = 10": (function_skill, 10)},
     ),
 }
 
@@ -60,7 +59,7 @@ JUDGED = {
 def make(name: str, out: Path, seed: int | None = None) -> Path:
     """Run the commands of a card, with another seed if one is given; returns what they made."""
     card = (ROOT / f"cards/models/{name}.md").read_text()
-    commands = re.findall(r"^tipl (?:train|fit).*$", card, re.MULTILINE)
+    commands = re.findall(r"^tipl train.*$", card, re.MULTILINE)
     named = name
     if seed is not None:
         commands = [re.sub(r"--seed \d+", f"--seed {seed}", command) for command in commands]
@@ -87,16 +86,16 @@ def measure(
     again = {name: make(name, out) for name in names}
     seeded = {(name, seed): make(name, out, seed) for name in names for seed in seeds}
     metrics = {name: found for name in names if (found := read_metrics(ZOO / name))}
-    (data,) = {one.results["data"] for one in metrics.values()}
+    (data,) = {one.results.data for one in metrics.values()}
     judging = JUDGED[data]
     results = judge(list(again.values()), data, judging, out / f"report-{data}", workers)
-    scores = results["forecasters"]
+    scores = dict(results.forecasters)
     if seeds:
         folder = out / f"report-{data}-seeds"
-        scores |= judge(list(seeded.values()), data, judging, folder, workers)["forecasters"]
+        scores |= judge(list(seeded.values()), data, judging, folder, workers).forecasters
     if beside:
         zoo = [ZOO / name for name in names]
-        known = judge(zoo, data, judging, out / f"report-{data}-zoo", workers)["forecasters"]
+        known = judge(zoo, data, judging, out / f"report-{data}-zoo", workers).forecasters
     else:
         known = {name: one.scores for name, one in metrics.items()}
     models = {
@@ -111,25 +110,23 @@ def measure(
         for name in names
     }
     return {
-        data: {"runs": results["runs"], "beside": beside, "seeds": seeds, "models": models},
+        data: {"runs": list(results.runs), "beside": beside, "seeds": seeds, "models": models},
     }
 
 
-def judge(models: list[Path], data: str, judging: Judging, out: Path, workers: int) -> Any:
+def judge(models: list[Path], data: str, judging: Judging, out: Path, workers: int) -> Results:
     """A result file."""
     options = f"--data {data} --out {out} {judging.options} --workers {workers}"
     run(["tipl", "evaluate", *map(str, models), *shlex.split(options)])
-    return json.loads((out / "results.json").read_text())
+    return read_results(out / "results.json")
 
 
-def at(scores: dict[str, Any], path: tuple[Any, ...]) -> Interval:
+def at(scores: Scores, figure: tuple[Measure, int]) -> Cell:
     """One figure of a forecaster."""
-    *keys, horizon = path
-    rows: Any = scores
-    for key in keys:
-        rows = rows[key]
-    row = next(row for row in rows if row["h"] == horizon)
-    return Interval(value=row["value"], low=row["low"], high=row["high"])
+    row = row_at(scores, *figure)
+    if row is None:
+        raise SystemExit("the evaluation has other horizons")
+    return Cell(value=row.value, low=row.low, high=row.high)
 
 
 def table(measured: dict[str, Any]) -> str:

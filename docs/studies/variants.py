@@ -12,13 +12,13 @@ import numpy as np
 from rich.progress import Progress
 
 import weighttraj as wt
-from tipl.baselines import Persistence
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.starts import starts_of
-from tipl.evaluation.statistics import Bootstrap, Interval, quotient
+from tipl.evaluation.statistics import Bootstrap, Cell, quotient
 from tipl.evaluation.weights import squared_errors
-from tipl.forecast import Forecaster
-from tipl.gate import GateTrainConfig, train_gate
+from tipl.forecaster import Forecaster
+from tipl.models.baselines import Persistence
+from tipl.models.gate import GateTrainConfig, train_gate
 from weighttraj.engine import Tell, engine_of
 
 HORIZONS = (1, 10, 50, 200)
@@ -52,7 +52,7 @@ def compare(variants: Mapping[str, GateTrainConfig], whole: str, workers: int) -
         workers: processes.
     """
     ((data,),) = {config.data for config in variants.values()}
-    (n_batches,) = {config.n_batches for config in variants.values()}
+    (n_batches,) = {config.training.n_batches for config in variants.values()}
     errors: dict[str, np.ndarray] = {}
     names = {config.out: name for name, config in variants.items()}
     with ExitStack() as stack:
@@ -113,6 +113,6 @@ def table(result: dict[str, Any]) -> str:
     )
 
 
-def _told(cell: Interval, sign: str = "") -> str:
+def _told(cell: Cell, sign: str = "") -> str:
     value, low, high = (f"{cell[key]:{sign}.3f}" for key in ("value", "low", "high"))
     return f"{value} [{low}, {high}]"

@@ -25,9 +25,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import tipl
 import weighttraj as wt
-from tipl.gate import Gate
-from tipl.gate.features import features
-from tipl.gate.history import History
+from tipl.models.gate import Gate
+from tipl.models.gate.features import features
+from tipl.models.gate.history import History
 from tipl.structure import Clock, Structure
 
 MODEL = "tipl-gate-half-cheetah-v4"

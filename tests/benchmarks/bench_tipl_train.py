@@ -19,21 +19,24 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from results import save
+from rich.console import Console
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from tipl.distributed import Ranks
-from tipl.models.gpt import GPT, GPTConfig
-from tipl.step import StepConfig, Stepper, weight_prediction_error
-from tipl.tokens import TokenRun, TokenSampler
+from tipl.models.tipl.data import TokenRun, TokenSampler, Windows
+from tipl.models.tipl.network import GPT, GPTConfig
+from tipl.models.tipl.train import LOOP, weight_prediction_error
+from tipl.training.loop import Learner, _Loop
+from tipl.training.parallel import Ranks
 
 SIZES = GPTConfig(rank=32, max_timestep=1950)
-CONFIG = StepConfig()
+CONFIG = LOOP
 Step = Callable[[int], object]
 
 
@@ -48,6 +51,30 @@ def sampler() -> TokenSampler:
         for _ in range(30)
     ]
     return TokenSampler(runs, window=SIZES.block_size, batch_size=CONFIG.batch_size, seed=0)
+
+
+class Windowed(Learner[Windows]):
+    """TIPL's network on these windows."""
+
+    def __init__(self, batches: TokenSampler) -> None:
+        self.network, self._batches = GPT(SIZES), batches
+
+    def batch(self, n: int) -> Windows:
+        return self._batches.batch(n)
+
+    def loss(self, network: Callable[..., Tensor], batch: Windows) -> tuple[Tensor, Tensor]:
+        predicted = network(batch.tokens, batch.timesteps, batch.mask)
+        return weight_prediction_error(predicted, batch), batch.mask.sum()
+
+    def save(self, out: Path) -> None:
+        """Nothing is saved."""
+
+
+def by_the_loop(batches: TokenSampler) -> Step:
+    learner = Windowed(batches)
+    loop = _Loop(learner, CONFIG, Path("nowhere"), Ranks(), Console(quiet=True))
+    loop._network = learner.network.train()
+    return loop.step
 
 
 class Transformers(nn.Module):
@@ -88,7 +115,8 @@ def by_transformers(batches: TokenSampler) -> Step:
 
     def step(n: int) -> None:
         batch = batches.batch(n)
-        loss = weight_prediction_error(model(batch.tokens, batch.timesteps, batch.mask), batch)
+        predicted = model(batch.tokens, batch.timesteps, batch.mask)
+        loss = weight_prediction_error(predicted, batch) / batch.mask.sum()
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(model.parameters(), CONFIG.grad_clip)
@@ -140,11 +168,11 @@ def main() -> None:
     args = parser.parse_args()
     torch.manual_seed(0)
     batches = sampler()
-    stepper = Stepper(GPT(SIZES), batches, CONFIG, Ranks())
+    ours = by_the_loop(batches)
     with FlopCounterMode(display=False) as counter:
-        stepper.step(0)
+        ours(0)
     flop = float(counter.get_total_flops())
-    steps: dict[str, Step] = {"ours": stepper.step, "product": products(flop)}
+    steps: dict[str, Step] = {"ours": ours, "product": products(flop)}
     if importlib.util.find_spec("transformers"):
         steps["transformers"] = by_transformers(batches)
     else:

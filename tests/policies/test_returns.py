@@ -19,7 +19,7 @@ from rich.console import Console
 from stable_baselines3 import PPO
 
 import weighttraj as wt
-from tipl.checks import run_like
+from tipl.checks.copies import run_like
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.engine import Tell
 from weighttraj.errors import EngineError, FormatError, PolicyError, StoreLockedError

@@ -22,10 +22,8 @@ def publish(data: str, model: str, folder: str) -> None:
 
 def use(data: str, model: str, out: str) -> None:
     dataset = wt.load_dataset(data, download=True)
-    train = tipl.TrainConfig(
-        data=dataset.path, out=Path(out) / "tipl", rank=8, n_batches=3, batch_size=8, seed=0
-    )
-    tipl.train(train)
+    train = tipl.TrainConfig(data=dataset.path, out=Path(out) / "tipl")
+    tipl.train(tipl.change(train, rank=8, n_batches=3, batch_size=8, seed=0))
     config = tipl.EvaluateConfig(
         data=data if data.startswith("file") else str(dataset.path),
         out=Path(out) / "results",
@@ -37,7 +35,7 @@ def use(data: str, model: str, out: str) -> None:
     )
     forecasters = [tipl.load(model), tipl.load(Path(out) / "tipl")]
     results = tipl.evaluate(forecasters, config)
-    print(json.dumps({"runs": len(dataset), "judged": list(results["forecasters"])}))
+    print(json.dumps({"runs": len(dataset), "judged": list(results.forecasters)}))
 
 
 if __name__ == "__main__":

@@ -314,7 +314,7 @@ def test_commands_say_the_same_of_an_address(tmp_path: Path) -> None:
         "that is here got: s3://bucket/a b what to do: weighttraj download 's3://bucket/a b', "
         "then name the folder that it makes"
     }
-    done = shell("tipl", "train", "--data", "x", "--out", "s3://bucket/x")
+    done = shell("tipl", "train", "tipl", "--data", "x", "--out", "s3://bucket/x")
     assert done.returncode == 1
     assert "not to an address" in done.stderr
 

@@ -15,7 +15,7 @@ import tipl
 import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote.conftest import files_of
-from tipl.gate import Gate
+from tipl.models.gate import Gate
 from weighttraj.errors import RegistryError, RemoteError
 from weighttraj.format import DatasetInfo
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
@@ -168,7 +168,7 @@ def test_a_model_of_ones_own(hub: stand_in.Hub, tmp_path: Path) -> None:
     assert type(tipl.load("hf://us/mine")) is type(model)
     gate = tipl.load(GATE)
     assert isinstance(gate, Gate)
-    gate.push_to_hub("us/mine-too", card=card)
+    tipl.push(gate, "hf://us/mine-too", card=card)
     assert tipl.load("hf://us/mine-too").name == "mine-too"
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from tipl.causal import Causal
-from tipl.causal.forecaster import CausalModelConfig
-from tipl.gate import Gate
-from tipl.gate.forecaster import GateModelConfig
-from tipl.models.causal import CausalConfig, CausalGPT
-from tipl.models.gate import GateConfig, GateNetwork
+from tipl.models.causal import Causal
+from tipl.models.causal.forecaster import CausalModelConfig
+from tipl.models.causal.network import CausalConfig, CausalGPT
+from tipl.models.gate import Gate
+from tipl.models.gate.forecaster import GateModelConfig
+from tipl.models.gate.network import GateConfig, GateNetwork
 
 HORIZONS = (1, 2, 5)
 GATE = GateConfig(horizons=HORIZONS, phases=5, width=16, experts=3)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,12 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 import weighttraj as wt
-from tipl import baselines
-from tipl.baselines import (
+from tipl.checks.copies import run_like
+from tipl.checks.measures import skills
+from tipl.errors import ForecastError, ModelError, TrainError
+from tipl.forecaster import Forecaster
+from tipl.models import baselines
+from tipl.models.baselines import (
     DMD,
     WNN,
     Ema,
@@ -25,22 +30,17 @@ from tipl.baselines import (
     Regression,
     Slope,
     Steps,
-    TrainingConfig,
-    by_name,
-    fit_ladder,
-    names,
-    save_ladder,
+    fit_baselines,
+    save_baselines,
 )
-from tipl.baselines.modes import cluster, find_references
-from tipl.baselines.subspace import prefix_basis
-from tipl.baselines.trajectory import Trajectory, thinned
-from tipl.checks import run_like, skills
-from tipl.errors import ForecastError, ModelError, TrainError
-from tipl.forecast import Forecaster
-from tipl.zoo import load
+from tipl.models.baselines.data import Trajectory, thinned
+from tipl.models.baselines.modes import cluster, find_references
+from tipl.models.baselines.nowcaster import LOOP
+from tipl.models.baselines.subspace import prefix_basis
+from tipl.registry import load, unfitted
 from weighttraj.errors import DamageError
 
-BRIEFLY = TrainingConfig(steps=30, batch_size=512)
+BRIEFLY = replace(LOOP, n_batches=30, batch_size=512)
 P = 122
 
 
@@ -58,7 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def ladder(small_dataset: Path) -> list[Forecaster]:
     runs = wt.open(small_dataset).split("train").runs
-    return fit_ladder(runs, horizons=(1, 2, 5), training=BRIEFLY)
+    return fit_baselines(runs, horizons=(1, 2, 5), training=BRIEFLY)
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +268,7 @@ def test_a_network_learns_what_can_be_learnt(
         swing = np.sin(0.2 * np.arange(100)[:, None] + rng.uniform(0, 6, P))
         return run_like(template, rng.normal(size=P) + 1e-2 * swing, folder)
 
-    training = TrainingConfig(steps=300, batch_size=512, learning_rate=1e-2)
+    training = replace(LOOP, n_batches=500, batch_size=512, learning_rate=1e-2)
     fitted = kind.fit([turning(0), turning(1)], horizons=[1, 5], training=training)
     assert (skills(fitted, [turning(2)], [1, 5]) > 0.9).all()
 
@@ -284,7 +284,7 @@ def test_networks_are_seeded(template: wt.Run, unseen: wt.Run) -> None:
 
 def test_validation_runs_choose_the_state(template: wt.Run, folder: Path, unseen: wt.Run) -> None:
     """On runs without anything to forecast the best network is one that has hardly learnt."""
-    training = TrainingConfig(steps=100, batch_size=512)
+    training = replace(LOOP, n_batches=100, batch_size=512)
     noise = walk(template, folder, {0: (0, 0)})
     plain = WNN.fit([unseen], horizons=[1, 5], training=training)
     chosen = WNN.fit([unseen], [noise], horizons=[1, 5], training=training)
@@ -306,17 +306,17 @@ def test_names_are_stable(ladder: list[Forecaster]) -> None:
         + [f"ema-{beta}-shrunk" for beta in (0.9, 0.95, 0.98)]
         + ["ar-20", "ar-20-phase", "ar-20-svd", "cmd", "lfd-2", "wnn", "nino-mlp"]
     )
-    assert names() == without
+    assert list(unfitted()) == without
     assert [forecaster.name for forecaster in ladder] == without + fitted
     assert all(forecaster.causal for forecaster in ladder)
-    assert by_name("ema-0.95") == Extrapolation(Ema(0.95))
+    assert load("ema-0.95") == Extrapolation(Ema(0.95))
     with pytest.raises(ForecastError, match=r"persistence, last-step(.|\n)*got: ar-20"):
-        by_name("ar-20")
+        load("ar-20")
 
 
 def test_all_are_saved_and_loaded(ladder: list[Forecaster], unseen: wt.Run, tmp_path: Path) -> None:
     ladder = [*ladder, Reconstruction(7)]
-    save_ladder(ladder, tmp_path)
+    save_baselines(ladder, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {made.name for made in ladder}
     for made in ladder:
         again = load(tmp_path / made.name)
@@ -344,7 +344,7 @@ def test_requests_that_cannot_be_met(ladder: list[Forecaster], unseen: wt.Run) -
         for starts, horizons in (([-1], [1]), ([49], [1]), ([3], [0]), ([], [1])):
             with pytest.raises(ForecastError, match="starts from 0 to 48, horizons from 1"):
                 made.forecast(unseen, starts, horizons)
-        if made.name not in names():
+        if made.name not in unfitted():
             with pytest.raises(ForecastError, match=r"among \[1, 2, 5\](.|\n)*got: \[3\]"):
                 made.forecast(unseen, [3], [1, 3])
 
@@ -363,7 +363,7 @@ def test_short_runs_are_refused(template: wt.Run, folder: Path) -> None:
         lambda: Regression.fit([short], Steps(20)),
         lambda: Regression.fit([], Steps(20)),
         lambda: WNN.fit([short], training=BRIEFLY),
-        lambda: fit_ladder([short]),
+        lambda: fit_baselines([short]),
     ):
         with pytest.raises(TrainError, match="too short"):
             fit()
@@ -372,21 +372,24 @@ def test_short_runs_are_refused(template: wt.Run, folder: Path) -> None:
             Regression.fit([short], Steps(20), horizons=horizons)
 
 
-def test_a_forecast_reads_no_later_rows(
-    ladder: list[Forecaster], template: wt.Run, tmp_path: Path
+def test_a_damaged_run_is_refused_and_a_decoded_one_is_not_read_again(
+    ladder: list[Forecaster], template: wt.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(0)
     weights = 1e-3 * rng.normal(size=(300, P)).cumsum(0)
     run = run_like(template, weights, tmp_path)
     before = [made.forecast(run, [100, 127], [1, 5]) for made in ladder]
-    for chunk in run.path.glob("*/*/c/2*"):  # rows 256 and later of every array
+    for chunk in run.path.glob("policy/weights/c/2*"):  # rows 256 and later
         for file in [chunk] if chunk.is_file() else chunk.iterdir():
             file.write_bytes(b"damaged")
     damaged = wt.open_run(run.path)
     for made, expected in zip(ladder, before, strict=True):
         assert np.array_equal(made.forecast(damaged, [100, 127], [1, 5]), expected), made.name
+    monkeypatch.setenv("WEIGHTTRAJ_CACHE", str(tmp_path / "cache"))
+    again = wt.open_run(run.path)
+    for made in ladder:
         with pytest.raises(DamageError):
-            made.forecast(damaged, [299], [1])
+            made.forecast(again, [100], [1])
 
 
 def test_a_fit_serves_policies_of_other_sizes(
@@ -409,7 +412,7 @@ def test_a_fit_serves_policies_of_other_sizes(
 
 def test_the_ladder_says_what_it_does(small_dataset: Path, ladder: list[Forecaster]) -> None:
     dataset, said = wt.open(small_dataset), []
-    again = fit_ladder(
+    again = fit_baselines(
         dataset.split("train").runs,
         dataset.split("test").runs[:1],
         horizons=(1, 2, 5),

@@ -11,7 +11,21 @@ import weighttraj as wt
 from tests.tipl.lively import HORIZONS as SOME
 from tests.tipl.lively import lively_causal, lively_gate
 from tipl import TIPL, Persistence, Reconstruction
-from tipl.baselines import (
+from tipl.checks import RefitConfig, refit_of
+from tipl.checks.copies import random_symmetry, random_walks, run_like
+from tipl.checks.measures import (
+    NULL,
+    TOLERANCE,
+    Fit,
+    causality,
+    check,
+    drift,
+    equivariance,
+    scale,
+    skills,
+)
+from tipl.forecaster import Forecaster
+from tipl.models.baselines import (
     DMD,
     WNN,
     Ema,
@@ -23,31 +37,16 @@ from tipl.baselines import (
     Regression,
     Slope,
     Steps,
-    TrainingConfig,
 )
-from tipl.checks import (
-    NULL,
-    TOLERANCE,
-    Fit,
-    causality,
-    check,
-    drift,
-    equivariance,
-    random_symmetry,
-    random_walks,
-    run_like,
-    scale,
-    skills,
-)
-from tipl.drift import Drift
-from tipl.forecast import Forecaster, TIPLConfig
-from tipl.models.gpt import GPT, GPTConfig
-from tipl.refit import RefitConfig, refit_of
+from tipl.models.baselines.nowcaster import LOOP
+from tipl.models.scaled import ScaledGate
+from tipl.models.tipl import TIPLConfig
+from tipl.models.tipl.network import GPT, GPTConfig
 from weighttraj.policies import load_policies
 
 HORIZONS = (1, 2, 5, 10)
 STEPS = 60
-BRIEFLY = TrainingConfig(steps=STEPS, batch_size=1024)
+BRIEFLY = replace(LOOP, n_batches=STEPS, batch_size=1024)
 
 
 def regression(features: object, by_phase: bool = False) -> Fit:
@@ -115,7 +114,7 @@ def test_baselines_with_a_fit(fit: Fit, fails: set[str], runs: list[wt.Run], fol
     assert {name for name, passed in found.passed.items() if not passed} == fails, found
 
 
-NETWORKS = [lively_gate(), lively_causal(), Drift(lively_gate(), {1: 4.0, 2: 2.0, 5: 1.5})]
+NETWORKS = [lively_gate(), lively_causal(), ScaledGate(lively_gate(), {1: 4.0, 2: 2.0, 5: 1.5})]
 
 
 @pytest.mark.parametrize("forecaster", NETWORKS, ids=label)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 from torch.nn import functional
 
-from tipl.models.gpt import GPT, Block, GPTConfig
+from tipl.models.tipl.network import GPT, Block, GPTConfig, attention_mask
 
 CONFIG = GPTConfig(rank=4, max_timestep=50, block_size=6, n_embd=16, n_head=2)
 
@@ -65,33 +65,27 @@ def test_sizes_are_decision_transformers() -> None:
     )
 
 
-def test_dropout_multiplies_what_is_kept() -> None:
+def test_dropout_is_drawn_in_training_from_the_seed() -> None:
     tokens, timesteps, mask = inputs()
-    whole = [torch.ones(3, size) for size in CONFIG.dropped]
-    assert len(whole) == 1 + 3 * CONFIG.n_layer
-    plain = model()(tokens, timesteps, mask)
-    torch.testing.assert_close(model()(tokens, timesteps, mask, whole), plain)
-    for site in range(len(whole)):
-        keep = [factors.clone() for factors in whole]
-        keep[site][1, -1] = 0.0  # in the second window: its last activation, or attention to it
-        changed = (model()(tokens, timesteps, mask, keep) != plain).any(2)
-        assert changed.any(1).tolist() == [False, True, False], site
-    nothing = [whole[0], *(torch.zeros_like(factors) for factors in whole[1:])]
     network = model()
-    x = network.embed_norm(network.embed_token(tokens) + network.embed_timestep(timesteps))
-    expected = network.head(network.final_norm(x))
-    torch.testing.assert_close(network(tokens, timesteps, mask, nothing), expected)
+    plain = network(tokens, timesteps, mask)
+    network.train()
+    drawn = []
+    for seed in (5, 5, 6):
+        torch.manual_seed(seed)
+        drawn.append(network(tokens, timesteps, mask))
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    assert not torch.equal(drawn[0], plain)
 
 
 def test_heads_attend_as_in_torch() -> None:
     """A block beside ``scaled_dot_product_attention``."""
-    block, config = Block(CONFIG), CONFIG
+    block = Block(CONFIG).eval()
     x = torch.randn(3, 6, 16)
-    hidden = torch.full((6, 6), -torch.inf).triu(1)
-    q, k, v = (
-        part.view(3, 6, config.n_head, -1).transpose(1, 2) for part in block.qkv(x).chunk(3, dim=2)
-    )
+    heads = (3, 6, CONFIG.n_head, -1)
+    q, k, v = (part.view(heads).transpose(1, 2) for part in block.qkv(x).chunk(3, dim=2))
     mixed = functional.scaled_dot_product_attention(q, k, v, is_causal=True)
-    expected = mixed.transpose(1, 2).reshape(18, 16)
-    ours = block._attend(x.flatten(0, 1), hidden.expand(6, 6, 6), None)
-    torch.testing.assert_close(ours, expected)
+    expected = block.proj(mixed.transpose(1, 2).reshape(3, 6, 16))
+    attn_mask = attention_mask(torch.ones(3, 6, dtype=torch.bool))
+    torch.testing.assert_close(block._attend(x, attn_mask), expected)

@@ -8,7 +8,7 @@ import pytest
 
 import weighttraj as wt
 from tipl.errors import TrainError
-from tipl.prepare import prepare
+from tipl.models.tipl.data import prepare
 from weighttraj.errors import FormatError
 from weighttraj.format import writer
 from weighttraj.format.catalog import write_dataset_info
@@ -44,7 +44,7 @@ def test_each_run_has_its_own_basis(tmp_path: Path) -> None:
     for run in prepared.train:
         np.testing.assert_allclose(run.coefficients.T @ run.coefficients, np.eye(3), atol=1e-5)
     assert (prepared.every, prepared.longest) == (64, 30)
-    assert prepared.digests.keys() == {"r0", "r3"}
+    assert prepared.checksums.keys() == {"r0", "r3"}
     # What comes after the last time embedding is left out.
     (held_out,) = prepared.validation
     assert held_out.coefficients.shape == (30, 3)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
-from rich.console import Console
 
-from tipl import cli
+from tipl.commands.evaluate import _table
 from tipl.errors import EvaluateError
-from tipl.report import insert_markdown
+from tipl.evaluation.results import Measure, Results, Row, read_results
 from tipl.report.figures import OTHERS, figures, skill_figure, styles, titles
-from tipl.report.markdown import places, render, rewrite
-from tipl.report.scores import GAIN, SKILL, row_at, that_matter
+from tipl.report.markdown import insert_markdown, places, render, rewrite
+from tipl.report.scores import GAIN, SKILL, row_at, shown
 from tipl.report.tables import cell, tables
 from tipl.report.verdict import paragraphs, verdict
+from weighttraj.terminal import Output
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path("datasets/demo/results.json")
@@ -34,26 +34,28 @@ def demo() -> dict[str, Any]:
     return document
 
 
-def shown(results: dict[str, Any], path: Sequence[str], h: int) -> str:
+def typed(document: dict[str, Any]) -> Results:
+    return msgspec.convert(document, Results)
+
+
+def told(document: dict[str, Any], measure: Measure, h: int) -> str:
     """A figure of TIPL as text."""
-    return cell(row_at(results["forecasters"]["tipl"], path, h))
+    return cell(row_at(typed(document).forecasters["tipl"], measure, h))
 
 
 @pytest.mark.parametrize("width", [80, 100, 250])
-def test_the_overview_cuts_nothing_off(
-    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_overview_cuts_nothing_off(width: int, capsys: pytest.CaptureFixture[str]) -> None:
     """In a terminal, with the long names of the zoo."""
-    results = json.loads((ROOT / "docs/results/inverted-pendulum-v4-ppo-v1.json").read_text())
-    monkeypatch.setattr(cli, "console", Console(width=width))
-    cli.console.print(cli._table(results))
+    results = read_results(ROOT / "docs/results/inverted-pendulum-v4-ppo-v1.json")
+    console = Output(width=width)
+    console.print(_table(results, console))
     said = capsys.readouterr().out
     assert "…" not in said
     assert max(map(len, said.splitlines())) <= width
     gate = next(line for line in said.splitlines() if "tipl-gate-" in line)
-    rows = results["forecasters"]["tipl-gate-inverted-pendulum-v4"]
-    for path, h in ((SKILL, 1), (SKILL, 50), (GAIN, 50)):
-        assert cell(row_at(rows, path, h), interval=width == 250) in gate
+    rows = results.forecasters["tipl-gate-inverted-pendulum-v4"]
+    for measure, h in ((SKILL, 1), (SKILL, 50), (GAIN, 50)):
+        assert cell(row_at(rows, measure, h), interval=width == 250) in gate
     assert ("the report has more columns" in said) == (width < 120)
 
 
@@ -77,7 +79,7 @@ def many(demo: dict[str, Any]) -> dict[str, Any]:
     for number in range(20):
         moved = shifted({"skill": forecasters["persistence"]["skill"]}, number / 100)
         gain = shifted({"gain": forecasters["persistence"]["gain"]}, -number / 100)
-        forecasters[f"base-{number}"] = {"causal": True, "floor": False} | copy | moved | gain
+        forecasters[f"base-{number}"] = {"causal": True} | copy | moved | gain
     forecasters["tipl-2"] = shifted(forecasters["persistence"], 0.5)
     ratio = {"value": 0.5, "low": 0.4, "high": 0.6}
     forecasters["tipl-2"]["repw_ratio"] = dict.fromkeys(demo["modes"], ratio)
@@ -89,46 +91,52 @@ def many(demo: dict[str, Any]) -> dict[str, Any]:
 
 def test_models_the_copy_and_the_best_baselines_matter(many: dict[str, Any]) -> None:
     best = ["base-19", "base-18", "base-17", "base-0"]  # three by skill, one by gain
-    assert that_matter(many) == ["tipl", "tipl-2", "persistence", *best]
+    assert shown(typed(many)) == ["tipl", "tipl-2", "persistence", *best]
 
 
 def test_the_others_are_grey_and_share_an_entry(many: dict[str, Any]) -> None:
-    drawn = styles(many)
+    drawn = styles(typed(many))
     coloured = {name: style["color"] for name, style in drawn.items() if "marker" in style}
-    assert set(coloured) == set(that_matter(many))
+    assert set(coloured) == set(shown(typed(many)))
     assert len(set(coloured.values())) == len(coloured)
     assert drawn["reconstruction-32"]["ls"] == "--"
     assert {drawn[f"base-{n}"]["label"] for n in range(1, 17)} == {OTHERS}
-    (legend,) = skill_figure(many).legends
+    (legend,) = skill_figure(typed(many)).legends
     said = [text.get_text() for text in legend.get_texts()]
     named = [name for name in said if name.startswith("base-")]
     assert sorted(named) == ["base-0", "base-17", "base-18", "base-19"]
-    assert {*said} - {*named} == {"TIPL", "tipl-2", "copy", "floor, rank 32", OTHERS}
+    assert {*said} - {*named} == {
+        "TIPL",
+        "tipl-2",
+        "persistence",
+        "reconstruction (oracle), rank 32",
+        OTHERS,
+    }
     assert len(said) == 9
 
 
 def test_a_line_below_the_frame_is_named(demo: dict[str, Any]) -> None:
-    (text,) = skill_figure(demo).axes[0].texts
+    (text,) = skill_figure(typed(demo)).axes[0].texts
     assert text.get_text() == "further down: TIPL"
 
 
 def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
-    assert titles(demo) == list(figures(demo))
-    assert len(titles(demo)) == 5
-    assert titles(demo | {"modes": []}) == ["Skill against horizon"]
+    assert titles(typed(demo)) == list(figures(typed(demo)))
+    assert len(titles(typed(demo))) == 5
+    assert titles(typed(demo | {"modes": []})) == ["Skill against horizon"]
 
 
 # The verdict
 
 
 def test_the_verdict_answers_in_weights_in_return_and_in_gain(many: dict[str, Any]) -> None:
-    first, second, rivals = paragraphs(many)
-    assert first.startswith("In weight error, TIPL loses to copying the last weights on 10 runs")
-    assert f"{shown(many, SKILL, 10)} at h = 10" in first
-    assert f"{shown(many, GAIN, 50)} at h = 50" in first
-    assert "tipl-2 beats copying the last weights on 10 runs that it was not trained on" in second
+    first, second, rivals = paragraphs(typed(many))
+    assert first.startswith("In weight error, TIPL loses to persistence on 10 runs")
+    assert f"{told(many, SKILL, 10)} at h = 10" in first
+    assert f"{told(many, GAIN, 50)} at h = 50" in first
+    assert "tipl-2 beats persistence on 10 runs that it was not trained on" in second
     assert "0.50 [0.49, 0.51] at h = 200" in second
-    assert "0.50 [0.40, 0.60] times the copy's with sampled actions (better)" in second
+    assert "0.50 [0.40, 0.60] times that of persistence with sampled actions (better)" in second
     assert rivals == (
         "Best of 20 baselines: in weight error at h = 1, base-19, 0.19 [0.18, 0.20]; "
         "in weight error at h = 10, base-19, 0.19 [0.18, 0.20]; "
@@ -142,7 +150,9 @@ def test_an_old_file_has_the_ratio_without_an_interval(demo: dict[str, Any]) -> 
         for name, scores in demo["forecasters"].items()
         if name in ("tipl", "persistence")
     ]
-    assert f"is {sums[1] / sums[0]:.3g} times the copy's with sampled actions," in verdict(demo)
+    assert f"is {sums[1] / sums[0]:.3g} times that of persistence with sampled actions," in verdict(
+        typed(demo)
+    )
 
 
 def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> None:
@@ -150,16 +160,16 @@ def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> 
         for key in ("repw", "gain", "scatter"):
             del scores[key]
     demo["modes"], demo["split"] = [], "train"
-    (said,) = paragraphs(demo)
+    (said,) = paragraphs(typed(demo))
     assert "on 10 runs that it may have been trained on" in said
-    assert said.endswith(f"{shown(demo, SKILL, 200)} at h = 200.")
+    assert said.endswith(f"{told(demo, SKILL, 200)} at h = 200.")
 
 
 def test_split_verdicts_say_where(many: dict[str, Any]) -> None:
     rows = many["forecasters"]["tipl-2"]["skill"]["ratio_of_sums"]["all"]
     rows[0] |= {"value": -0.3, "low": -0.4, "high": -0.2}
-    said = paragraphs(many)[1]
-    assert "tipl-2 splits with copying" in said
+    said = paragraphs(typed(many))[1]
+    assert "tipl-2 splits with persistence" in said
     assert said.split(" It is ")[1].startswith("better at h = 2, 3,")
     assert "100, 200, worse at h = 1. In return" in said
 
@@ -169,7 +179,7 @@ def test_split_verdicts_say_where(many: dict[str, Any]) -> None:
     [(0.123, "0.12"), (12.345, "12.35"), (-123.4, "-123"), (-22134.0, "-22100"), (None, "-")],
 )
 def test_numbers_have_three_digits(value: float | None, said: str) -> None:
-    assert cell({"value": value, "low": None, "high": None}) == said
+    assert cell(Row(h=1, value=value)) == said
 
 
 # Places
@@ -187,7 +197,7 @@ def test_every_section_is_written_in_its_place(demo: dict[str, Any], tmp_path: P
     other = page_of("verdict", source=Path("other.json"))
     page.write_text(page_of(*SECTIONS) + other)
     assert all(place.empty for place in places(page.read_text()))
-    insert_markdown(demo, DEMO, page)
+    insert_markdown(typed(demo), DEMO, page)
     text = page.read_text()
     assert text.endswith(other)
     assert [place.section for place in places(text) if not place.empty] == list(SECTIONS)
@@ -196,22 +206,22 @@ def test_every_section_is_written_in_its_place(demo: dict[str, Any], tmp_path: P
     pictures = sorted(path.name for path in (tmp_path / "results").iterdir())
     assert len(pictures) == 5
     assert all(f"](results/{name})" in text for name in pictures)
-    assert rewrite(text, "results", str(DEMO), partial(render, demo, DEMO)) == text
+    assert rewrite(text, "results", str(DEMO), partial(render, typed(demo), DEMO)) == text
     changed = demo | {"command": "tipl evaluate something else"}
-    again = rewrite(text, "results", str(DEMO), partial(render, changed, DEMO))
+    again = rewrite(text, "results", str(DEMO), partial(render, typed(changed), DEMO))
     assert again == text.replace(demo["command"], changed["command"]) != text
 
 
 def test_without_a_section_it_is_the_overview(demo: dict[str, Any]) -> None:
     bare = f"<!-- results of {DEMO} -->\n<!-- end of results -->\n"
-    text = rewrite(bare, "results", str(DEMO), lambda section: render(demo, DEMO, section))
-    assert f"| TIPL | {shown(demo, SKILL, 1)} |" in text
-    assert verdict(demo) in text
+    text = rewrite(bare, "results", str(DEMO), lambda section: render(typed(demo), DEMO, section))
+    assert f"| TIPL | {told(demo, SKILL, 1)} |" in text
+    assert verdict(typed(demo)) in text
 
 
 def test_important_tables_are_open_and_the_others_folded(demo: dict[str, Any]) -> None:
-    text = render(demo, DEMO, "tables")
-    main = [table.title for table in tables(demo) if table.main]
+    text = render(typed(demo), DEMO, "tables")
+    main = [table.title for table in tables(typed(demo)) if table.main]
     assert main == [
         "Skill: ratio of sums, all starts",
         "Function skill: divergence of policies",
@@ -220,12 +230,12 @@ def test_important_tables_are_open_and_the_others_folded(demo: dict[str, Any]) -
     before, _, folded = text.partition("<details>")
     assert all(f"**{title}**" in before for title in main)
     assert "Skill: mean of the ratios" in folded
-    assert text.count("<summary>") == len(tables(demo)) - len(main)
-    assert "future of the run: TIPL, floor, rank 32." in folded
+    assert text.count("<summary>") == len(tables(typed(demo))) - len(main)
+    assert "future of the run: TIPL, reconstruction (oracle), rank 32." in folded
 
 
 def test_the_source_says_how_it_was_judged(demo: dict[str, Any]) -> None:
-    text = render(demo, DEMO, "source")
+    text = render(typed(demo), DEMO, "source")
     for said in (
         "version 1; 10 runs of its test split: seed0040",
         "3,000 for weights",
@@ -241,7 +251,7 @@ def test_a_page_without_a_place_is_refused(demo: dict[str, Any], tmp_path: Path)
     for text in ("# Nothing\n", page_of("verdict", source=Path("other.json")), unclosed):
         page.write_text(text)
         with pytest.raises(EvaluateError, match="no place for these results"):
-            insert_markdown(demo, DEMO, page)
+            insert_markdown(typed(demo), DEMO, page)
         assert page.read_text() == text
 
 
@@ -249,4 +259,4 @@ def test_an_unknown_section_is_refused(demo: dict[str, Any], tmp_path: Path) -> 
     page = tmp_path / "page.md"
     page.write_text(page_of("poem"))
     with pytest.raises(EvaluateError, match=r"no such section of results(.|\n)*overview, verdict"):
-        insert_markdown(demo, DEMO, page)
+        insert_markdown(typed(demo), DEMO, page)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import weighttraj as wt
 from tipl import TemporalSVD
 from tipl.errors import RepresentationError
-from tipl.representation import PrefixBases, Trajectory, fit_run, fit_shared, rows, svd
+from tipl.representation import PrefixBases, RunOrRows, fit_run, fit_shared, rows, svd
 
 
 def path(n: int = 60, size: int = 30, seed: int = 0) -> np.ndarray:
@@ -365,7 +365,7 @@ def test_weights_that_are_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_matrices_that_are_no_trajectories_are_refused(
-    trajectories: list[Trajectory], message: str
+    trajectories: list[RunOrRows], message: str
 ) -> None:
     with pytest.raises(RepresentationError, match=message):
         fit_shared(trajectories, rank=3)

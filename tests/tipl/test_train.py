@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 
 import weighttraj as wt
-from tipl import TIPL, Persistence, Reconstruction, TemporalSVD, TrainConfig, train
+from tipl import TIPL, Persistence, Reconstruction, TemporalSVD, TrainConfig, change, train
 from tipl.errors import ForecastError, ModelError, TrainError
 from weighttraj.errors import FormatError
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
@@ -22,9 +22,8 @@ from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 
 @pytest.fixture
 def config(small_dataset: Path, tmp_path: Path) -> TrainConfig:
-    return TrainConfig(
-        data=small_dataset,
-        out=tmp_path / "model",
+    return change(
+        TrainConfig(data=small_dataset, out=tmp_path / "model"),
         rank=8,
         n_batches=6,
         batch_size=8,
@@ -41,7 +40,7 @@ def log(config: TrainConfig) -> list[dict[str, float]]:
 
 
 def test_training_lowers_the_loss_and_writes_a_log(config: TrainConfig) -> None:
-    train(replace(config, n_batches=300, learning_rate=1e-2, save_every=100))
+    train(change(config, n_batches=300, learning_rate=1e-2, save_every=100))
     lines = log(config)
     assert [line["batch"] for line in lines] == [100, 200, 300]
     assert lines[-1]["wpe"] < 0.2 * lines[0]["wpe"]
@@ -57,7 +56,7 @@ def test_validation_is_one_step_ahead_without_dropout(config: TrainConfig, tmp_p
     write_dataset_info(data, replace(info, runs=tuple(runs)))
     # With a window of one, each forecast is from one token, as in training. 200 batches between
     # lines are enough for an error on all 48 windows.
-    settings = replace(config, data=data, block_size=1, dropout=0.5, save_every=200, n_batches=200)
+    settings = change(config, data=data, block_size=1, dropout=0.5, save_every=200, n_batches=200)
     model, run = train(settings), wt.open(data).split("validation").runs[0]
     (line,) = log(config)
     weights = run.weights[:]
@@ -66,13 +65,13 @@ def test_validation_is_one_step_ahead_without_dropout(config: TrainConfig, tmp_p
     forecasts = model.forecast(run, range(48), [1])[:, 0]
     assert line["validation_wpe"] == pytest.approx(np.mean((truth - forecasts) ** 2), rel=1e-4)
     # It leaves the parameters alone.
-    parameters = train(replace(settings, data=config.data, out=tmp_path / "plain")).model
+    parameters = train(change(settings, data=config.data, out=tmp_path / "plain")).network
     for name, tensor in parameters.state_dict().items():
-        assert torch.equal(tensor, model.model.state_dict()[name]), name
+        assert torch.equal(tensor, model.network.state_dict()[name]), name
 
 
 def test_what_was_logged_and_not_saved_is_logged_once(config: TrainConfig) -> None:
-    train(replace(config, n_batches=3))
+    train(change(config, n_batches=3))
     with (config.out / "log.jsonl").open("a") as file:  # a process died before it saved
         file.write(json.dumps({"batch": 6, "wpe": 1e9}) + "\n")
     train(config)
@@ -85,7 +84,7 @@ def test_a_bar_shows_speed_and_error(config: TrainConfig) -> None:
     train(config, console=console)
     shown = console.file.getvalue()  # type: ignore[attr-defined]
     assert "6/6" in shown
-    assert re.search(r"\d batches/s, WPE \d", shown)
+    assert re.search(r"\d batches/s, wpe \d", shown)
 
 
 def test_the_number_of_threads_is_put_back(config: TrainConfig) -> None:
@@ -97,23 +96,23 @@ def test_the_number_of_threads_is_put_back(config: TrainConfig) -> None:
 def test_an_interrupted_training_ends_as_an_undisturbed_one(
     config: TrainConfig, tmp_path: Path
 ) -> None:
-    whole = train(config).model.state_dict()
-    broken = replace(config, out=tmp_path / "broken")
-    train(replace(broken, n_batches=3))
-    again = train(broken).model.state_dict()
+    whole = train(config).network.state_dict()
+    broken = change(config, out=tmp_path / "broken")
+    train(change(broken, n_batches=3))
+    again = train(broken).network.state_dict()
     for name, tensor in whole.items():
         assert torch.equal(tensor, again[name]), name
 
 
 def test_a_finished_training_is_loaded(config: TrainConfig) -> None:
     first, second = train(config), train(config)
-    for a, b in zip(first.model.parameters(), second.model.parameters(), strict=True):
+    for a, b in zip(first.network.parameters(), second.network.parameters(), strict=True):
         assert torch.equal(a, b)
 
 
 def test_seeds_matter(config: TrainConfig, tmp_path: Path) -> None:
-    one, two = train(config), train(replace(config, seed=1, out=tmp_path / "other"))
-    assert not torch.equal(one.model.head.weight, two.model.head.weight)
+    one, two = train(config), train(change(config, seed=1, out=tmp_path / "other"))
+    assert not torch.equal(one.network.head.weight, two.network.head.weight)
 
 
 def test_a_saved_model_forecasts_the_same(config: TrainConfig) -> None:
@@ -140,7 +139,7 @@ def test_one_step_is_the_network_on_the_last_window(config: TrainConfig) -> None
     tokens = torch.from_numpy(svd.transform(weights)[6:11].astype(np.float32))[None]
     mask = torch.ones(1, 5, dtype=torch.bool)
     with torch.no_grad():
-        u = model.model(tokens, torch.arange(6, 11)[None], mask)[0, -1]
+        u = model.network(tokens, torch.arange(6, 11)[None], mask)[0, -1]
     expected = svd.inverse_transform(u.numpy())
     np.testing.assert_allclose(model.forecast(run, [10], [1])[0, 0], expected, atol=1e-6)
 
@@ -154,7 +153,7 @@ def test_starts_do_not_see_each_other(config: TrainConfig) -> None:
 def test_other_settings_are_not_mixed(config: TrainConfig) -> None:
     train(config)
     with pytest.raises(TrainError, match="'rank': 8"):
-        train(replace(config, rank=9))
+        train(change(config, rank=9))
 
 
 def test_other_data_are_not_mixed(config: TrainConfig, tmp_path: Path) -> None:
@@ -165,20 +164,20 @@ def test_other_data_are_not_mixed(config: TrainConfig, tmp_path: Path) -> None:
     runs = [replace(run, split="train") if run.id == "seed0002" else run for run in info.runs]
     write_dataset_info(other, replace(info, runs=tuple(runs)))
     with pytest.raises(TrainError, match="seed0002"):
-        train(replace(config, data=other))
+        train(change(config, data=other))
     moved = tmp_path / "moved"
     shutil.copytree(config.data, moved)
-    train(replace(config, data=moved))
+    train(change(config, data=moved))
 
 
 def test_a_longer_training_is_not_passed_off_as_a_shorter_one(config: TrainConfig) -> None:
     train(config)
     with pytest.raises(TrainError, match="longer training"):
-        train(replace(config, n_batches=5))
+        train(change(config, n_batches=5))
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("changes", "message"),
     [
         ({"n_head": 3}, "n_embd a multiple of n_head"),
         ({"seed": -1}, "seed of at least 0"),
@@ -192,10 +191,10 @@ def test_a_longer_training_is_not_passed_off_as_a_shorter_one(config: TrainConfi
     ],
 )
 def test_impossible_settings_leave_no_folder(
-    config: TrainConfig, change: dict[str, Any], message: str
+    config: TrainConfig, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(TrainError, match=message):
-        train(replace(config, **change))
+        train(change(config, **changes))
     assert not config.out.exists()
 
 
@@ -204,12 +203,12 @@ def test_a_data_set_without_training_runs_is_refused(config: TrainConfig, tmp_pa
     info = replace(read_dataset_info(config.data), runs=(), status="collecting")
     write_dataset_info(tmp_path / "dataset", info)
     with pytest.raises(FormatError, match="no runs"):
-        train(replace(config, data=tmp_path / "dataset"))
+        train(change(config, data=tmp_path / "dataset"))
 
 
 def test_a_loss_that_explodes_stops_the_training(config: TrainConfig) -> None:
     with pytest.raises(TrainError, match="lower --learning-rate"):
-        train(replace(config, learning_rate=1e30, n_batches=50))
+        train(change(config, learning_rate=1e30, n_batches=50))
 
 
 def test_a_damaged_model_is_not_loaded(config: TrainConfig) -> None:
@@ -233,9 +232,9 @@ def test_runs_that_do_not_fit_the_model_are_refused(config: TrainConfig) -> None
         for forecaster in (model, Persistence(), Reconstruction(3)):
             with pytest.raises(ForecastError, match="starts from 0 to 48, horizons from 1"):
                 forecaster.forecast(run, starts, horizons)
-    other = TIPL(model.model, replace(model.config, every=64))
+    other = TIPL(model.network, replace(model.config, every=64))
     with pytest.raises(ModelError, match="another cadence"):
         other.forecast(run, [1], [1])
-    other = TIPL(model.model, replace(model.config, parameters=7))
+    other = TIPL(model.network, replace(model.config, parameters=7))
     with pytest.raises(ModelError, match=r"another structure(.|\n)*of 7 parameters(.|\n)*122"):
         other.forecast(run, [1], [1])

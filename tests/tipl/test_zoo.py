@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -20,23 +21,25 @@ from tipl import (
     EvaluateConfig,
     Reconstruction,
     TrainConfig,
-    baselines,
+    change,
     cli,
     evaluate,
     load,
     train,
 )
-from tipl.baselines import Extrapolation, Slope
-from tipl.drift import Further
 from tipl.errors import EvaluateError, ForecastError, ModelError
-from tipl.evaluation.parts import fingerprint
-from tipl.forecast import TIPLConfig
-from tipl.gate import GateTrainConfig, train_gate
-from tipl.models.gpt import GPT, GPTConfig
+from tipl.evaluation.results import read_results
+from tipl.models.baselines import Extrapolation, Slope
+from tipl.models.gate import GateTrainConfig, train_gate
+from tipl.models.scaled import Scaled
+from tipl.models.tipl import TIPLConfig
+from tipl.models.tipl.network import GPT, GPTConfig
+from tipl.registry import MODELS, names, unfitted
 from tipl.report.markdown import places
-from tipl.zoo import names
-from tipl.zoo.card import facts, listed, metrics_of, refreshed, write_card
-from tipl.zoo.lookup import MODELS
+from tipl.report.scores import SKILL
+from tipl.saved import fingerprint
+from tipl.zoo.card import facts, metrics_of, refreshed, write_card
+from tipl.zoo.listing import listed
 from tipl.zoo.metrics import read_metrics
 from tipl.zoo.release import LINES, MOST, release, thinned
 from weighttraj.format.catalog import read_dataset_info, write_dataset_info
@@ -44,7 +47,7 @@ from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("name", baselines.names())
+@pytest.mark.parametrize("name", unfitted())
 def test_what_needs_no_fit_is_loaded_by_name(name: str) -> None:
     assert load(name).name == name
 
@@ -55,21 +58,22 @@ def test_fitted_baselines_are_loaded_by_folder(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    command = ["tipl", "fit", str(small_dataset), "--out", str(tmp_path), "--steps", "20"]
-    command += ["--horizons", "1", "5", "20"]
+    command = ["tipl", "train", "baselines", "--data", str(small_dataset), "--out", str(tmp_path)]
+    command += ["--steps", "20", "--horizons", "1", "5", "20"]
     monkeypatch.setattr(sys, "argv", command)
     cli.main()
     said = capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
     assert {"persistence", "ar-20-phase", "wnn"} < names
-    assert all(load(tmp_path / name).name == name and name in said for name in names)
+    assert all(load(tmp_path / name).name == name for name in names)
+    assert f"{len(names)} baselines in {tmp_path}" in said
     settings = json.loads((tmp_path / "wnn/train.json").read_text())
     assert (settings["horizons"], settings["steps"]) == ([1, 5, 20], 20)
     assert list(settings["runs"]) == [run.id for run in wt.open(small_dataset).split("train")]
 
 
 def test_a_name_that_nobody_has_is_refused() -> None:
-    with pytest.raises(ForecastError, match=r"there is no such forecaster(.|\n)*tipl fit"):
+    with pytest.raises(ForecastError, match=r"there is no such forecaster(.|\n)*tipl train"):
         load("crystal-ball")
 
 
@@ -95,7 +99,7 @@ def trained(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """A model trained for a moment, with a log."""
     out = tmp_path_factory.mktemp("trained") / "model"
     sizes = {"rank": 8, "block_size": 5, "n_layer": 1, "n_embd": 16}
-    train(TrainConfig(data=small_dataset, out=out, n_batches=20, warmup=5, **sizes))
+    train(change(TrainConfig(data=small_dataset, out=out), n_batches=20, warmup=5, **sizes))
     return out
 
 
@@ -124,7 +128,7 @@ def checks(trained: Path, small_dataset: Path) -> Path:
 def zoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty zoo in the place of the package's."""
     folder = tmp_path / "zoo"
-    monkeypatch.setattr("tipl.zoo.lookup.MODELS", folder)
+    monkeypatch.setattr("tipl.registry.MODELS", folder)
     assert names() == []
     return folder
 
@@ -166,13 +170,10 @@ def test_metrics_say_everything(trained: Path, zoo: Path, results: Path, checks:
     (data,) = found.trained_on
     assert data.runs == ("seed0000", "seed0001")
     assert (data.data, data.every, data.environment) == ("small", 2, "InvertedPendulum-v4")
-    assert found.results["runs"] == ["seed0002", "seed0003"]
-    judged = json.loads(results.read_text())["forecasters"]
-    assert set(found.results["forecasters"]) == set(judged)
-    assert (
-        found.scores["skill"]["ratio_of_sums"]["all"]
-        == (judged["model"]["skill"]["ratio_of_sums"]["all"])
-    )
+    assert found.results.runs == ("seed0002", "seed0003")
+    evaluated = read_results(results).forecasters
+    assert set(found.results.forecasters) == set(evaluated)
+    assert SKILL(found.scores) == SKILL(evaluated["model"])
     assert found.settings["rank"] == 8
     assert not {"out", "data", "runs"} & set(found.settings)
     assert [line["batch"] for line in found.log] == [20]
@@ -227,14 +228,16 @@ def test_what_lies_in_the_zoo_can_be_judged_anew(
     release(out, "tipl-small", results=anew)
     found = read_metrics(out)
     assert first is not None
-    assert found == replace(first, results=first.results | {"runs": ["seed0003"]})
+    assert found == replace(
+        first, results=msgspec.structs.replace(first.results, runs=("seed0003",))
+    )
 
 
 def test_what_goes_along_another_is_released_with_it(zoo: Path, tmp_path: Path) -> None:
-    Further(Extrapolation(Slope(5)), {1: 2.0}).save(tmp_path / "further")
+    Scaled(Extrapolation(Slope(5)), {1: 2.0}).save(tmp_path / "further")
     release(tmp_path / "further", "trend-5-further")
     found = load("trend-5-further")
-    assert isinstance(found, Further)
+    assert isinstance(found, Scaled)
     assert (found.along, found.amplitudes) == (Extrapolation(Slope(5)), {1: 2.0})
 
 
@@ -259,7 +262,7 @@ def test_a_large_model_is_rounded_and_is_float32_again(
     assert (out / "model.safetensors").stat().st_size < MOST
     loaded = load("big")
     assert isinstance(loaded, TIPL)
-    assert {p.dtype for p in loaded.model.state_dict().values()} == {torch.float32}
+    assert {p.dtype for p in loaded.network.state_dict().values()} == {torch.float32}
     run = wt.open(small_dataset).split("test").runs[0]
     rounded, exact = (m.forecast(run, [10], [1, 5]) for m in (loaded, model))
     assert not np.array_equal(rounded, exact)
@@ -328,7 +331,7 @@ def test_a_card_keeps_its_prose(
     assert "datasets:\n- small\n" in text
     assert {place.section for place in places(text) if not place.empty} == {
         "summary",
-        "ladder",
+        "baselines",
         "checks",
         "training",
         "commands",
@@ -339,7 +342,7 @@ def test_a_card_keeps_its_prose(
     after = [text.split(f"{head}\n\n", 1)[1] for head in headings if "\n" not in head]
     assert not any(rest.startswith("#") for rest in after)
     mine = text.replace("## Limits", "Prose by hand.\n\n## Limits")
-    stale = mine.replace("learnt from: `small`", "learnt from: `other`")
+    stale = mine.replace("trained on: `small`", "trained on: `other`")
     assert stale != mine
     card.write_text(stale)
     write_card("tipl-small", tmp_path / "cards")
@@ -378,9 +381,9 @@ def test_the_card_of_amplitudes_shows_what_chose_them(
     assert "Settings of the network: width 16" in training
     assert "![" not in training
     _, gate, drift, judged, _ = commands.splitlines()
-    assert gate == "tipl train-gate --data small --out GATE --width 16 --horizons 1 5"
-    assert drift == "tipl train-drift --along GATE --data small --out FOLDER --episodes 3"
-    assert judged == metrics.results["command"]
+    assert gate == "tipl train gate --data small --out GATE --width 16 --horizons 1 5"
+    assert drift == "tipl train scaled --along GATE --data small --out FOLDER --episodes 3"
+    assert judged == metrics.results.command
 
 
 def test_cards_refuse_what_they_cannot_say(
@@ -388,7 +391,7 @@ def test_cards_refuse_what_they_cannot_say(
 ) -> None:
     release(trained, "tipl-small", results=results)
     metrics = metrics_of("tipl-small")
-    with pytest.raises(ModelError, match=r"no such section of a card(.|\n)*summary, ladder"):
+    with pytest.raises(ModelError, match=r"no such section of a card(.|\n)*summary, baselines"):
         facts(metrics, "poem")
     with pytest.raises(EvaluateError, match="no place for these facts"):
         refreshed("# A card of something else\n", metrics)
@@ -418,7 +421,7 @@ def test_the_commands_go_all_the_way(
         return capsys.readouterr().out
 
     monkeypatch.chdir(tmp_path)
-    assert "a draft: judge it with" in call("release", trained, "--name", "tipl-a")
+    assert "a draft: evaluate it with" in call("release", trained, "--name", "tipl-a")
     few = ["--learning-starts", "0", "--function-starts", "0", "--bootstrap", "10"]
     data = ["--data", small_dataset]
     call("evaluate", "tipl-a", *data, "--out", "judged", "--horizons", "1", "10", *few)
@@ -441,9 +444,9 @@ def test_a_gate_is_released_with_its_data_sets(
     write_dataset_info(other, replace(info, id="other"))
     out = tmp_path / "model"
     train_gate(
-        GateTrainConfig(
-            data=(small_dataset, other), out=out, horizons=(1, 5), starts=20, n_batches=4,
-            batch_size=4, validate_every=2, width=8, experts=2,
+        change(
+            GateTrainConfig(data=(small_dataset, other), out=out), horizons=(1, 5), starts=20,
+            n_batches=4, batch_size=4, save_every=2, width=8, experts=2,
         )
     )  # fmt: skip
     few = {"horizons": (1, 5), "learning_starts": 0, "function_starts": 0, "bootstrap": 10}
@@ -452,10 +455,10 @@ def test_a_gate_is_released_with_its_data_sets(
     release(out, "tipl-gate-small", results=judged.out / "results.json")
     text = write_card("tipl-gate-small", tmp_path / "cards").read_text()
     assert "datasets:\n- small\n- other\n" in text
-    assert text.count("- learnt from: ") == 2
-    assert "tipl train-gate --data small other --out FOLDER --horizons 1 5 --starts 20" in text
-    assert " --no-adam\n" in text
-    assert "After 4 batches, the squared error over the copy's" in text
+    assert text.count("- trained on: ") == 2
+    assert "tipl train gate --data small other --out FOLDER --starts 20 --horizons 1 5" in text
+    assert " --no-adam " in text
+    assert "After 4 batches, the squared error over that of persistence" in text
     assert (tmp_path / "cards/tipl-gate-small.svg").exists()
     assert listed("tipl-gate-small")[1:3] == ("gate", "yes")
 

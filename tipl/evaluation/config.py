@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 from tipl.errors import EvaluateError
+from tipl.horizons import HORIZONS
 from tipl.settings import check_settings
-
-HORIZONS = (*range(1, 11), 20, 50, 100, 200)
-"""Snapshots ahead, as the results report them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +20,7 @@ class EvaluateConfig:
     out: Path
     """Folder of the results. What was measured before an interruption is kept there."""
     split: Literal["train", "validation", "test"] = "test"
-    """Runs that are judged on."""
+    """Split of the runs that forecasters are evaluated on."""
     horizons: tuple[int, ...] = HORIZONS
     """Snapshots ahead; those beyond half of the shortest run are left out."""
     starts: int = 2_000
@@ -69,4 +67,4 @@ class EvaluateConfig:
         )
 
 
-__all__ = ["HORIZONS", "EvaluateConfig"]
+__all__ = ["EvaluateConfig"]

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 import weighttraj as wt
-from tipl.baselines import Persistence, Reconstruction
 from tipl.errors import EvaluateError
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.measure import Measured, Task, function_starts, measure
-from tipl.evaluation.parts import fingerprint
-from tipl.evaluation.returns import MODES, is_floor
+from tipl.evaluation.results import Results, StartCounts, write_results
+from tipl.evaluation.returns import MODES
 from tipl.evaluation.starts import starts_of
 from tipl.evaluation.summary import Summary
-from tipl.forecast import TIPL, Forecaster
-from tipl.report import write_report
+from tipl.forecaster import Forecaster, check_forecaster
+from tipl.registry import load
+from tipl.runs import fault_of, weights_of, without_faults
 from weighttraj.engine import Engine, engine_of
 from weighttraj.progress import LoggedProgress
 
@@ -34,16 +32,16 @@ def evaluate(
     workers: int = 1,
     imports: Sequence[str] = (),
     console: Console | None = None,
-) -> dict[str, Any]:
-    """Judge forecasters beside the copy of the last weights; writes results and a page.
+) -> Results:
+    """Evaluate forecasters beside persistence, and write ``results.json``.
 
-    Writes ``results.json``, ``report.html`` and figures into ``config.out``, and keeps there what
-    was measured: the same call goes on where it stopped, and more forecasters cost only their own.
+    What was measured is kept in ``config.out``: the same call goes on where it stopped, and more
+    forecasters cost only their own measurements.
 
     Args:
-        forecasters: who is judged; the copy is added, and the floor of each TIPL's rank.
+        forecasters: what is evaluated; persistence is added, and the oracle of each TIPL's rank.
         config: on what, and how much.
-        workers: processes; 1 means this one.
+        workers: number of processes; 1 means this one.
         imports: modules that register environments; every worker imports them.
         console: where progress is shown; None: nowhere.
 
@@ -55,60 +53,95 @@ def evaluate(
             forecasters have one name.
         KeyboardInterrupt: it was stopped; what was measured stays.
     """
+    for forecaster in forecasters:
+        check_forecaster(forecaster)
     config = config.bounded()
     dataset = wt.open_dataset(config.data)
-    runs = dataset.split(config.split).runs
+    runs, left_out = _whole_runs(dataset.split(config.split).runs, config)
     _check_runs(runs, config)
-    half = min(len(run) for run in runs) // 2
-    config = replace(config, horizons=_up_to(half, config.horizons, "--horizons"))
-    if config.learning_starts:
-        within = _up_to(half, config.return_horizons, "--return-horizons")
-        config = replace(config, return_horizons=within)
-    copy = Persistence()
-    ranks = sorted({f.config.gpt.rank for f in forecasters if isinstance(f, TIPL)})
-    floors = (Reconstruction(rank) for rank in ranks)
-    everyone = (copy, *(f for f in forecasters if f.name != copy.name), *floors)
-    _check_names(everyone)
+    config = _within(config, min(len(run) for run in runs) // 2)
+    everyone = _everyone(forecasters)
     tasks = [Task(path=run.path.absolute(), forecasters=everyone, config=config) for run in runs]
-    starts_of(runs[0], config)  # too short, or no returns: said before hours of work
+    starts_of(runs[0], config)  # what is too short or has no returns is refused before the work
     with engine_of(workers, imports=imports) as engine:
         measured = _measure(tasks, engine, console or Console(quiet=True))
-    summary = Summary(measured, config, copy.name)
-    results = {
-        "data": dataset.info.id,
-        "version": dataset.info.version,
-        "split": config.split,
-        "runs": [run.id for run in runs],
-        "env_steps_per_snapshot": _env_steps_of(runs[0]),
-        "horizons": list(config.horizons),
-        "return_horizons": list(config.return_horizons) if config.learning_starts else [],
-        "modes": list(MODES) if config.learning_starts else [],
-        "episodes": config.episodes,
-        "seed": config.seed,
-        "quick": config.quick,
-        "starts": {
-            "weights": sum(len(m.starts.weights) for m in measured),
-            "policies": sum(len(m.function_starts) for m in measured),
-            "learning": sum(len(m.starts.learning) for m in measured),
-            "plateau": sum(len(m.starts.plateau) for m in measured),
-        },
-        "noise_floor": summary.noise() if config.learning_starts else {},
-        "forecasters": {
-            f.name: {
-                "kind": getattr(f, "kind", None),
-                "causal": f.causal,
-                "floor": is_floor(f),
-                "fingerprint": fingerprint(f),
-                **summary.of(f.name),
-            }
-            for f in everyone
-        },
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-    }
-    config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / "results.json").write_text(json.dumps(results, indent=1), encoding="utf-8")
-    write_report(results, config.out)
+    summary = Summary(measured, config, everyone[0].name)
+    results = Results(
+        data=dataset.info.id,
+        version=dataset.info.version,
+        split=config.split,
+        runs=tuple(run.id for run in runs),
+        left_out=left_out,
+        env_steps_per_snapshot=_env_steps_of(runs[0]),
+        horizons=config.horizons,
+        return_horizons=config.return_horizons if config.learning_starts else (),
+        modes=MODES if config.learning_starts else (),
+        episodes=config.episodes,
+        seed=config.seed,
+        quick=config.quick,
+        starts=_counts(measured),
+        noise_floor=summary.noise() if config.learning_starts else {},
+        forecasters={forecaster.name: summary.of(forecaster) for forecaster in everyone},
+        command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    )
+    write_results(config.out / "results.json", results)
     return results
+
+
+def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
+    """Return what is evaluated: persistence, the forecasters, and their oracles.
+
+    Raises:
+        EvaluateError: two of them have one name.
+    """
+    persistence = load("persistence")
+    oracles = {o.name: o for f in forecasters for o in getattr(f, "oracles", ())}
+    everyone = (
+        persistence,
+        *(f for f in forecasters if f.name != persistence.name),
+        *(oracles[name] for name in sorted(oracles)),
+    )
+    _check_names(everyone)
+    return everyone
+
+
+def _whole_runs(
+    runs: Sequence[wt.Run], config: EvaluateConfig
+) -> tuple[list[wt.Run], dict[str, str]]:
+    """Leave out runs that nothing can be evaluated on, and say why.
+
+    Raises:
+        EvaluateError: no run is left.
+    """
+    kept, faults = without_faults(runs, lambda run: fault_of(weights_of(run)))
+    if not kept:
+        raise EvaluateError(
+            "none of the runs can be evaluated on",
+            expected="runs with finite weights that change",
+            got="; ".join(f"{run}: {why}" for run, why in faults.items()),
+            where=f"{config.data}, split {config.split}",
+            do="choose another --split, or collect other runs",
+        )
+    return kept, faults
+
+
+def _within(config: EvaluateConfig, half: int) -> EvaluateConfig:
+    """Return the config without horizons beyond half of the shortest run."""
+    config = replace(config, horizons=_up_to(half, config.horizons, "--horizons"))
+    if not config.learning_starts:
+        return config
+    return replace(
+        config, return_horizons=_up_to(half, config.return_horizons, "--return-horizons")
+    )
+
+
+def _counts(measured: Sequence[Measured]) -> StartCounts:
+    return StartCounts(
+        weights=sum(len(m.starts.weights) for m in measured),
+        policies=sum(len(m.function_starts) for m in measured),
+        learning=sum(len(m.starts.learning) for m in measured),
+        plateau=sum(len(m.starts.plateau) for m in measured),
+    )
 
 
 def _up_to(half: int, horizons: Sequence[int], option: str) -> tuple[int, ...]:
@@ -137,7 +170,7 @@ def _check_runs(runs: Sequence[wt.Run], config: EvaluateConfig) -> None:
             expected="one layout of the parameters",
             got=sorted(f"{layout.size} parameters" for layout in layouts),
             where=f"{config.data}, split {config.split}",
-            do="judge on one kind of policy at a time",
+            do="evaluate on one kind of policy at a time",
         )
     if config.function_starts and any(not run.info.probe_observations for run in runs):
         raise EvaluateError(

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from tipl.evaluation.config import EvaluateConfig
-from tipl.evaluation.parts import Arrays, Parts, fingerprint, run_source
+from tipl.evaluation.parts import Arrays, Parts, run_source
 from tipl.evaluation.returns import FRESH, MODES, Player, forecast_returns, true_returns
 from tipl.evaluation.starts import Starts, at_boundary, starts_of
 from tipl.evaluation.weights import Tick, divergences, squared_errors
-from tipl.forecast import Forecaster
+from tipl.forecaster import Forecaster
+from tipl.saved import fingerprint
 from tipl.threads import threads
 from weighttraj import Place, Run, open_run
 from weighttraj.engine import Tell
@@ -22,12 +23,12 @@ from weighttraj.engine import Tell
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One run on which forecasters are judged."""
+    """One run on which forecasters are evaluated."""
 
     path: Place
     """The run."""
     forecasters: tuple[Forecaster, ...]
-    """Who is judged; the first one is the copy."""
+    """What is evaluated; the first one is persistence."""
     config: EvaluateConfig
     """How."""
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tipl.forecast import Forecaster
+from tipl.runs import checksum_of
 from weighttraj import Run
 from weighttraj.atomic import replacing
 
@@ -20,7 +18,7 @@ Arrays = dict[str, np.ndarray]
 
 
 class Parts:
-    """A folder of measurements. Each says what it was made from; what no longer fits is made anew.
+    """A folder of measurements. Each says what it was made from; what no longer fits is made again.
 
     Args:
         folder: it.
@@ -46,19 +44,8 @@ class Parts:
 
 
 def run_source(run: Run) -> dict[str, Any]:
-    """What tells a run from any other."""
-    return {"run": run.id, "digest": hashlib.sha256(run["digest"][:].tobytes()).hexdigest()}
-
-
-def fingerprint(forecaster: Forecaster) -> str:
-    """Hash of all that a forecaster saves of itself."""
-    digest = hashlib.sha256()
-    with tempfile.TemporaryDirectory() as folder:
-        forecaster.save(folder)
-        for file in sorted(Path(folder).rglob("*")):
-            if file.is_file():
-                digest.update(file.name.encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+    """Return what tells a run from any other."""
+    return {"run": run.id, "digest": checksum_of(run)}
 
 
 def _read(path: Path, wanted: str) -> Arrays | None:
@@ -76,4 +63,4 @@ def _write(path: Path, source: str, arrays: Arrays) -> None:
         np.savez_compressed(file, source=np.array(source), **arrays)  # type: ignore[arg-type]
 
 
-__all__ = ["Arrays", "Parts", "fingerprint", "run_source"]
+__all__ = ["Arrays", "Parts", "run_source"]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from tipl.evaluation.parts import Arrays
 from tipl.evaluation.weights import Tick
-from tipl.forecast import Forecaster
+from tipl.forecaster import Forecaster
+from tipl.runs import weights_of
 from weighttraj import Run
 from weighttraj.policies import Evaluator, PolicyBatch, env_of, load_policies
 
@@ -97,23 +97,18 @@ def forecast_returns(
 ) -> Arrays:
     """Returns of forecast policies.
 
-    They act with the normaliser of the start: the later one is the future's. A floor, which is no
-    forecast, acts with the later one.
+    They act with the normaliser of the start: the later one is the future's. An oracle, which is
+    no forecast, acts with the later one.
 
     Returns:
         ``forecast``: float64 (mode, start, horizon).
     """
     weights = forecaster.forecast(run, starts.tolist(), list(horizons))
     at = np.repeat(starts, len(horizons))
-    rows = (starts[:, None] + np.asarray(horizons)).ravel() if is_floor(forecaster) else at
+    rows = (starts[:, None] + np.asarray(horizons)).ravel() if forecaster.is_oracle else at
     policies = load_policies(run, rows).with_weights(weights.reshape(len(at), -1))
     found = player.returns(policies, at, tick)
     return {"forecast": found.reshape(len(found), len(starts), len(horizons))}
-
-
-def is_floor(forecaster: Any) -> bool:
-    """Whether it shows the truth through a representation, and forecasts nothing."""
-    return bool(getattr(forecaster, "floor", False))
 
 
 def hold_log_std(
@@ -125,7 +120,7 @@ def hold_log_std(
         return weights
     place = run.layout["log_std"].slice
     held = weights.copy()
-    held[:, place] = run.weights[starts][:, place]
+    held[:, place] = weights_of(run)[starts][:, place]
     return held
 
 
@@ -135,4 +130,4 @@ def _keys(policies: PolicyBatch) -> list[bytes]:
     return [b"".join([part[row].tobytes() for part in parts]) for row in range(len(policies))]
 
 
-__all__ = ["FRESH", "MODES", "Player", "forecast_returns", "is_floor", "true_returns"]
+__all__ = ["FRESH", "MODES", "Player", "forecast_returns", "true_returns"]

@@ -75,7 +75,7 @@ def learning_phase(run: Run) -> int:
             "the runs have no returns, so nothing tells when they have learned",
             expected="returns of the stored policies",
             where=run.path,
-            do="weighttraj returns DATASET, or --learning-starts 0 to judge weights only",
+            do="weighttraj returns DATASET, or --learning-starts 0 to evaluate weights only",
         )
     mean = run.mean_return(deterministic=False not in run.evaluation.deterministic)
     rows = np.flatnonzero(np.isfinite(mean))

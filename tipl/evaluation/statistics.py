@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-Interval = dict[str, float | None]
+Cell = dict[str, float | None]
 """``value``, and the ends ``low`` and ``high`` of its 95 % interval; None with a single run."""
 
 
@@ -31,7 +31,7 @@ class Bootstrap:
         self,
         statistic: Callable[..., Float[np.ndarray, "*cell"]],
         *samples: Float[np.ndarray, "run *shape"],
-    ) -> list[Interval]:
+    ) -> list[Cell]:
         """A statistic of all runs, for each of its cells in order.
 
         Args:
@@ -81,7 +81,7 @@ def interquartile_mean(values: Float[np.ndarray, "run *cell"]) -> Float[np.ndarr
 
 def _intervals(
     value: Float[np.ndarray, "*cell"], drawn: Float[np.ndarray, "resample cells"]
-) -> list[Interval]:
+) -> list[Cell]:
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
     return [
         {"value": _plain(v), "low": _plain(a), "high": _plain(b)}
@@ -93,4 +93,4 @@ def _plain(value: np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-__all__ = ["Bootstrap", "Interval", "interquartile_mean", "mean", "quotient", "ratio_of_sums"]
+__all__ = ["Bootstrap", "Cell", "interquartile_mean", "mean", "quotient", "ratio_of_sums"]

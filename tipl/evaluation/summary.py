@@ -10,16 +10,19 @@ from jaxtyping import Bool, Float
 
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.measure import Measured
+from tipl.evaluation.results import GainRow, Interval, Points, Row, Rows, Scores
 from tipl.evaluation.returns import MODES
 from tipl.evaluation.starts import shares
 from tipl.evaluation.statistics import (
     Bootstrap,
-    Interval,
+    Cell,
     interquartile_mean,
     mean,
     quotient,
     ratio_of_sums,
 )
+from tipl.forecaster import Forecaster
+from tipl.saved import fingerprint
 
 KINDS = ("all", "within", "boundary")
 """Starts: all; those whose next step stays in the iteration; those whose next step leaves it."""
@@ -40,24 +43,31 @@ class Summary:
     Args:
         measured: what was measured, run by run.
         config: how.
-        copy: name of the forecaster that every other is compared with.
+        persistence: name of the forecaster that every other is compared with.
     """
 
-    def __init__(self, measured: Sequence[Measured], config: EvaluateConfig, copy: str) -> None:
-        self._measured, self._config, self._copy = measured, config, copy
+    def __init__(
+        self, measured: Sequence[Measured], config: EvaluateConfig, persistence: str
+    ) -> None:
+        self._measured, self._config, self._copy = measured, config, persistence
         self._bootstrap = Bootstrap(resamples=config.bootstrap, seed=config.seed)
 
-    def of(self, name: str) -> dict[str, Any]:
-        """All figures of one forecaster."""
-        scores: dict[str, Any] = {"skill": self._skills(name), "wpe": self._wpe(name)}
-        if self._measured[0].functions:
-            scores["function_skill"] = self._function_skills(name)
-        if self._measured[0].true:
-            scores["repw"] = self._repw(name)
-            scores["repw_ratio"] = self._repw_ratio(name)
-            scores["gain"] = self._gain(name)
-            scores["scatter"] = self._scatter(name)
-        return scores
+    def of(self, forecaster: Forecaster) -> Scores:
+        """Return all figures of one forecaster."""
+        name, some = forecaster.name, self._measured[0]
+        return Scores(
+            kind=forecaster.kind,
+            causal=forecaster.causal,
+            is_oracle=forecaster.is_oracle,
+            fingerprint=fingerprint(forecaster),
+            skill=self._skills(name),
+            wpe=self._wpe(name),
+            function_skill=self._function_skills(name) if some.functions else {},
+            repw=self._repw(name) if some.true else {},
+            repw_ratio=self._repw_ratio(name) if some.true else {},
+            gain=self._gain(name) if some.true else {},
+            scatter=self._scatter(name) if some.true else {},
+        )
 
     def noise(self) -> dict[str, float]:
         """Mean difference between a true policy's returns over two sets of episodes, by mode."""
@@ -65,7 +75,7 @@ class Summary:
         each = np.concatenate(gaps, axis=1).mean((1, 2))
         return dict(zip(MODES, each.tolist(), strict=True))
 
-    def _skills(self, name: str) -> dict[str, Any]:
+    def _skills(self, name: str) -> dict[str, dict[str, Rows]]:
         runs = [
             (
                 m.weights[name]["squared"],
@@ -77,7 +87,7 @@ class Summary:
         ]
         return {aggregate: self._by_kind(aggregate, runs) for aggregate in AGGREGATES}
 
-    def _function_skills(self, name: str) -> dict[str, Any]:
+    def _function_skills(self, name: str) -> dict[str, Rows]:
         runs = [
             (
                 m.functions[name]["kl"][..., None],
@@ -91,7 +101,7 @@ class Summary:
 
     def _by_kind(
         self, aggregate: str, runs: Sequence[tuple[Errors, Errors, Chosen, Shares]]
-    ) -> dict[str, Any]:
+    ) -> dict[str, Rows]:
         """A skill over each kind of start, of runs that may have different starts."""
         found = {}
         for kind in KINDS:
@@ -104,7 +114,7 @@ class Summary:
             found[kind] = self._rows(self._config.horizons, cells)
         return found
 
-    def _wpe(self, name: str) -> list[dict[str, Any]]:
+    def _wpe(self, name: str) -> Rows:
         size = self._measured[0].tensors.sum()
         each = [
             np.average(m.weights[name]["squared"].sum(2), axis=0, weights=shares(m.starts.weights))
@@ -113,7 +123,7 @@ class Summary:
         ]
         return self._rows(self._config.horizons, self._bootstrap.interval(mean, np.stack(each)))
 
-    def _repw(self, name: str) -> dict[str, Any]:
+    def _repw(self, name: str) -> dict[str, dict[str, Rows]]:
         """|J(true) - J(forecast)|, means over the starts of each run."""
         horizons = self._config.return_horizons
         return {
@@ -127,7 +137,7 @@ class Summary:
         }
 
     def _repw_ratio(self, name: str) -> dict[str, Interval]:
-        """REPW over the copy's in the learning phase, both summed over the paper's horizons.
+        """REPW over that of persistence in the learning phase, summed over the paper's horizons.
 
         Paired: an interval draws a run with its errors of both.
         """
@@ -138,7 +148,8 @@ class Summary:
                 self._gaps(each, i, "learning")[:, near].sum(1, keepdims=True)
                 for each in (name, self._copy)
             )
-            (found[mode],) = self._bootstrap.interval(ratio_of_sums, ours, copy)
+            (cell,) = self._bootstrap.interval(ratio_of_sums, ours, copy)
+            found[mode] = Interval(**cell)
         return found
 
     def _gaps(self, name: str, mode: int, phase: str) -> Float[np.ndarray, "run horizon"]:
@@ -146,17 +157,14 @@ class Summary:
         arms = self._arms(name, mode, phase)
         return np.stack([_mean(np.abs(later - forecast)) for _, later, forecast in arms])
 
-    def _gain(self, name: str) -> dict[str, Any]:
+    def _gain(self, name: str) -> dict[str, tuple[GainRow, ...]]:
         """What a forecast earns of what training earns, over the learning phase."""
         found = {}
         for i, mode in enumerate(MODES):
             arms = list(self._arms(name, i, "learning"))
             earned = np.stack([(forecast - now[:, None]).sum(0) for now, _, forecast in arms])
             trained = np.stack([(later - now[:, None]).sum(0) for now, later, _ in arms])
-            rows = self._rows(
-                self._config.return_horizons,
-                self._bootstrap.interval(ratio_of_sums, earned, trained),
-            )
+            cells = self._bootstrap.interval(ratio_of_sums, earned, trained)
             now, later, forecast = (
                 interquartile_mean(np.concatenate(arm))
                 for arm in zip(
@@ -164,24 +172,32 @@ class Summary:
                     strict=True,
                 )
             )
-            for j, row in enumerate(rows):
-                row |= {"now": float(now[j]), "later": float(later[j])}
-                row |= {"forecast": float(forecast[j])}
-            found[mode] = rows
+            found[mode] = tuple(
+                GainRow(
+                    h=h,
+                    now=float(now[j]),
+                    later=float(later[j]),
+                    forecast=float(forecast[j]),
+                    **cells[j],
+                )
+                for j, h in enumerate(self._config.return_horizons)
+            )
         return found
 
-    def _scatter(self, name: str) -> dict[str, Any]:
+    def _scatter(self, name: str) -> dict[str, tuple[Points, ...]]:
         """Returns of true and forecast policies, for the paper's horizons."""
         near = [i for i, h in enumerate(self._config.return_horizons) if h <= 10]
         return {
-            mode: [
-                {
-                    "run": m.run,
-                    "true": m.true["later"][i][:, near].round(1).ravel().tolist(),
-                    "forecast": m.returns[name]["forecast"][i][:, near].round(1).ravel().tolist(),
-                }
+            mode: tuple(
+                Points(
+                    run=m.run,
+                    true=tuple(m.true["later"][i][:, near].round(1).ravel().tolist()),
+                    forecast=tuple(
+                        m.returns[name]["forecast"][i][:, near].round(1).ravel().tolist()
+                    ),
+                )
                 for m in self._measured
-            ]
+            )
             for i, mode in enumerate(MODES)
             if mode != "held"
         }
@@ -194,8 +210,8 @@ class Summary:
             arms = m.true["now"], m.true["later"], m.returns[name]["forecast"]
             yield tuple(arm[mode][part] for arm in arms)
 
-    def _rows(self, horizons: Sequence[int], cells: list[Interval]) -> list[dict[str, Any]]:
-        return [{"h": h, **cell} for h, cell in zip(horizons, cells, strict=True)]
+    def _rows(self, horizons: Sequence[int], cells: list[Cell]) -> Rows:
+        return tuple(Row(h=h, **cell) for h, cell in zip(horizons, cells, strict=True))
 
 
 def _of_kind(kind: str, boundary: Chosen) -> Chosen:
@@ -208,7 +224,7 @@ def _summed(aggregate: str, error: Errors, copy: Errors, share: Shares) -> tuple
     Args:
         aggregate: which skill.
         error: of the forecasts.
-        copy: of the copy.
+        copy: errors of persistence.
         share: how much each start counts; 0: it is left out.
     """
     if aggregate == "mean_of_ratios":

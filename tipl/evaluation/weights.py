@@ -10,7 +10,8 @@ from jaxtyping import Float, Float32, Int
 from torch.distributions import Normal, kl_divergence
 
 from tipl.evaluation.parts import Arrays
-from tipl.forecast import Forecaster
+from tipl.forecaster import Forecaster
+from tipl.runs import weights_of
 from weighttraj import Run
 from weighttraj.policies import PolicyBatch, load_policies
 
@@ -36,7 +37,7 @@ def squared_errors(
     offsets = [param.offset for param in run.layout.params]
     parts = []
     for chunk, forecast in _forecasts(forecaster, run, starts, horizons, run.layout.size):
-        error = forecast - _later(run.weights, chunk, horizons)
+        error = forecast - _later(weights_of(run), chunk, horizons)
         np.square(error, out=error)
         parts.append(np.add.reduceat(error, offsets, axis=2, dtype=np.float64))
         tick(len(chunk))

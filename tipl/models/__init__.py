@@ -1,1 +1,1 @@
-"""Networks only: tensors in, tensors out."""
+"""Forecasters, one folder for each: the network, its data, its training, and the forecaster."""

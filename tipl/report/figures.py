@@ -1,13 +1,13 @@
 """Results as pictures.
 
-A few forecasters have colours: the models, the copy and the best baselines. The others are grey, so
-that twenty of them leave a picture that can be read. Floors are dashed.
+A few forecasters have colours: the models, persistence and the best baselines. The others are grey,
+so that twenty of them leave a picture that can be read. Oracles are dashed.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,15 +16,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tipl.evaluation.results import GainRow, Results, Row
 from tipl.report.scores import (
-    COPY,
-    FUNCTION_SKILL,
+    PERSISTENCE,
     SKILL,
-    Row,
-    floors,
+    function_skill,
     models,
-    rows_of,
-    that_matter,
+    oracles,
+    repw,
+    shown,
+    skill,
+    wpe,
 )
 from tipl.report.tables import MODE_NAMES, label
 
@@ -32,7 +34,7 @@ OTHERS = "other baselines"
 """Their entry in legends."""
 _OF_MODELS = ("#c0392b", "#e67e22", "#8e44ad", "#d6529e")
 _OF_BASELINES = ("#2471a3", "#17a589", "#7d6608", "#5dade2")
-_COPY, _GREY = "#1c1c1c", "#a6acaf"
+_BLACK, _GREY = "#1c1c1c", "#a6acaf"
 _LOWEST = -0.5
 """Skills and gains below are cut off."""
 
@@ -40,12 +42,12 @@ Style = dict[str, Any]
 """Of a line, as ``Axes.plot`` takes it."""
 
 
-def figures(results: dict[str, Any]) -> dict[str, Figure]:
+def figures(results: Results) -> dict[str, Figure]:
     """All figures of a page, by title."""
     return {title: draw() for title, draw in _plans(results).items()}
 
 
-def titles(results: dict[str, Any]) -> list[str]:
+def titles(results: Results) -> list[str]:
     """Of all figures of a page; nothing is drawn."""
     return list(_plans(results))
 
@@ -55,31 +57,31 @@ def file_name(title: str) -> str:
     return title.lower().replace("'", "").replace(",", "").replace(" ", "-") + ".png"
 
 
-def _plans(results: dict[str, Any]) -> dict[str, Callable[[], Figure]]:
+def _plans(results: Results) -> dict[str, Callable[[], Figure]]:
     found = {"Skill against horizon": partial(skill_figure, results)}
-    if results["modes"]:
+    if results.modes:
         found["Inference gain against horizon"] = partial(gain_figure, results)
         found["Return of one forecast"] = partial(return_figure, results)
         found |= {
             f"The paper's figure, {MODE_NAMES[mode]}": partial(paper_figure, results, mode)
-            for mode in results["modes"]
+            for mode in results.modes
             if mode != "held"
         }
     return dict(found)
 
 
-def skill_figure(results: dict[str, Any]) -> Figure:
+def skill_figure(results: Results) -> Figure:
     """Skill in weights, all starts and at boundaries, and in function."""
     fig = Figure(figsize=(12, 4.6), layout="constrained")
     panels = [
         ("weights, all starts", SKILL),
-        ("weights, next step in a new iteration", ("skill", "ratio_of_sums", "boundary")),
-        ("policies (divergence)", FUNCTION_SKILL),
+        ("weights, next step in a new iteration", skill(starts="boundary")),
+        ("policies (divergence)", function_skill),
     ]
     all_axes = fig.subplots(1, 3, sharey=True)
-    for axes, (title, path) in zip(all_axes, panels, strict=True):
+    for axes, (title, measure) in zip(all_axes, panels, strict=True):
         for name, style in styles(results).items():
-            _draw_band(axes, rows_of(results["forecasters"][name], path), style)
+            _draw_band(axes, measure(results.forecasters[name]), style)
         axes.set_xscale("log")
         axes.set_ylim(_LOWEST, 1)
         _name_those_below(axes)
@@ -89,13 +91,13 @@ def skill_figure(results: dict[str, Any]) -> Figure:
     return fig
 
 
-def gain_figure(results: dict[str, Any]) -> Figure:
+def gain_figure(results: Results) -> Figure:
     """What a forecast earns of what training earns, in each action mode."""
     fig = Figure(figsize=(12, 4.6), layout="constrained")
     all_axes = fig.subplots(1, 3, sharey=True)
-    for axes, mode in zip(all_axes, results["modes"], strict=True):
+    for axes, mode in zip(all_axes, results.modes, strict=True):
         for name, style in styles(results).items():
-            _draw_band(axes, rows_of(results["forecasters"][name], ("gain", mode)), style)
+            _draw_band(axes, results.forecasters[name].gain.get(mode, ()), style)
         axes.axhline(1, ls=":", color="black", lw=1)
         axes.set_xscale("log")
         axes.set_ylim(_LOWEST, 1.2)
@@ -106,22 +108,22 @@ def gain_figure(results: dict[str, Any]) -> Figure:
     return fig
 
 
-def return_figure(results: dict[str, Any]) -> Figure:
+def return_figure(results: Results) -> Figure:
     """Returns of forecast policies beside the environment steps that PPO takes instead.
 
     Interquartile means over starts in the learning phase of all runs. A forecast takes no step.
     """
     fig = Figure(figsize=(12, 4.6), layout="constrained")
     all_axes = fig.subplots(1, 3, sharey=True)
-    each = results.get("env_steps_per_snapshot")
-    for axes, mode in zip(all_axes, results["modes"], strict=True):
+    each = results.env_steps_per_snapshot
+    for axes, mode in zip(all_axes, results.modes, strict=True):
         for name, style in styles(results).items():
-            rows = rows_of(results["forecasters"][name], ("gain", mode))
-            if not results["forecasters"][name]["floor"]:
+            rows = results.forecasters[name].gain.get(mode, ())
+            if not results.forecasters[name].is_oracle:
                 axes.plot(*_curve(rows, "forecast", each), **style)
         trained = {"color": "black", "ls": ":", "lw": 2, "zorder": 4, "label": "PPO itself"}
         axes.plot(
-            *_curve(rows_of(results["forecasters"][COPY], ("gain", mode)), "later", each), **trained
+            *_curve(results.forecasters[PERSISTENCE].gain.get(mode, ()), "later", each), **trained
         )
         axes.set_xscale("log")
         axes.set_title(MODE_NAMES[mode], fontsize=10)
@@ -131,50 +133,53 @@ def return_figure(results: dict[str, Any]) -> Figure:
     return fig
 
 
-def _curve(rows: list[Row], key: str, each: float | None) -> tuple[list[float], list[float]]:
-    """Returns against environment steps, or against snapshots where these are not known."""
-    known = [row for row in rows if row.get(key) is not None]
-    return [row["h"] * (each or 1) for row in known], [row[key] for row in known]
+def _curve(
+    rows: Sequence[GainRow], key: str, each: float | None
+) -> tuple[list[float], list[float]]:
+    """Return returns against environment steps, or against snapshots where these are unknown."""
+    found = [(row.h * (each or 1), getattr(row, key)) for row in rows]
+    known = [(x, y) for x, y in found if y is not None]
+    return [x for x, _ in known], [y for _, y in known]
 
 
-def paper_figure(results: dict[str, Any], mode: str) -> Figure:
-    """The paper's figure, with what it leaves out: the copy, baselines, the floor and the noise.
+def paper_figure(results: Results, mode: str) -> Figure:
+    """Return the paper's figure, with persistence, baselines, the oracle and the noise beside it.
 
     Left: WPE and REPW against the forecast step. Right: return of the true policy against the
     return of the forecast policy, over all steps, of those that have a colour.
     """
     fig = Figure(figsize=(12, 4.6), layout="constrained")
-    wpe, repw, scatter = fig.subplots(1, 3)
-    coloured = that_matter(results)
+    errors, returns, scatter = fig.subplots(1, 3)
+    coloured = shown(results)
     for name, style in styles(results).items():
-        scores = results["forecasters"][name]
-        for axes, rows in ((wpe, scores["wpe"]), (repw, scores["repw"][mode]["learning"])):
-            near = [row for row in rows if row["h"] <= 10]
-            axes.plot([row["h"] for row in near], [row["value"] for row in near], **style)
-        for points in scores["scatter"][mode] if name in coloured else []:
+        scores = results.forecasters[name]
+        for axes, measure in ((errors, wpe), (returns, repw(mode, "learning"))):
+            near = [row for row in measure(scores) if row.h <= 10]
+            axes.plot([row.h for row in near], [row.value for row in near], **style)
+        for points in scores.scatter.get(mode, ()) if name in coloured else ():
             dots = {"ms": 2, "alpha": 0.3, "color": style["color"]}
-            scatter.plot(points["true"], points["forecast"], "o", **dots)
-    floor = results["noise_floor"][mode]
-    repw.axhline(floor, ls=":", color="black", label="noise: true policy, other episodes")
-    _label(wpe, "forecast step h", "WPE: mean squared error of weights")
-    wpe.set_yscale("log")
-    _label(repw, "forecast step h", "REPW while learning: |J(true) - J(forecast)|")
-    repw.set_ylim(bottom=0)
+            scatter.plot(points.true, points.forecast, "o", **dots)
+    noise = results.noise_floor[mode]
+    returns.axhline(noise, ls=":", color="black", label="noise: true policy, other episodes")
+    _label(errors, "forecast step h", "WPE: mean squared error of weights")
+    errors.set_yscale("log")
+    _label(returns, "forecast step h", "REPW while learning: |J(true) - J(forecast)|")
+    returns.set_ylim(bottom=0)
     _label(scatter, "J(true policy)", "J(forecast policy)")
     scatter.axline((0, 0), slope=1, ls=":", color="black")
     _legend(fig)
     return fig
 
 
-def styles(results: dict[str, Any]) -> dict[str, Style]:
+def styles(results: Results) -> dict[str, Style]:
     """How each forecaster is drawn."""
-    coloured, ours, dashed = that_matter(results), models(results), floors(results)
-    rivals = [name for name in coloured if name not in (*ours, COPY)]
+    coloured, ours, dashed = shown(results), models(results), oracles(results)
+    rivals = [name for name in coloured if name not in (*ours, PERSISTENCE)]
     colors = dict(zip(ours, _cycle(_OF_MODELS, len(ours)), strict=True))
     colors |= dict(zip(rivals, _cycle(_OF_BASELINES, len(rivals)), strict=True))
-    colors[COPY] = _COPY
+    colors[PERSISTENCE] = _BLACK
     found: dict[str, Style] = {}
-    for name in results["forecasters"]:
+    for name in results.forecasters:
         if name in coloured:
             line = {"color": colors[name], "marker": "o", "ms": 3, "lw": 1.5, "zorder": 3}
             found[name] = line | {"label": label(name)}
@@ -190,15 +195,18 @@ def _cycle(colors: tuple[str, ...], count: int) -> list[str]:
     return [colors[i % len(colors)] for i in range(count)]
 
 
-def _draw_band(axes: Axes, rows: list[Row], style: Style) -> None:
-    """A line, and its interval where it has a colour of its own."""
-    rows = [row for row in rows if row["value"] is not None]
+def _draw_band(axes: Axes, rows: Sequence[Row], style: Style) -> None:
+    """Draw a line, and its interval where it has a colour of its own."""
+    rows = [row for row in rows if row.value is not None]
     if not rows:
         return
-    h = [row["h"] for row in rows]
-    axes.plot(h, [row["value"] for row in rows], **style)
-    if "marker" in style and rows[0]["low"] is not None:
-        low, high = ([row[end] for row in rows] for end in ("low", "high"))
+    h = [row.h for row in rows]
+    value, low, high = (
+        np.array([getattr(row, end) for row in rows], np.float64)  # None becomes NaN
+        for end in ("value", "low", "high")
+    )
+    axes.plot(h, value, **style)
+    if "marker" in style and rows[0].low is not None:
         axes.fill_between(h, low, high, alpha=0.15, color=style["color"], linewidth=0)
 
 

@@ -20,9 +20,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tipl.errors import EvaluateError
+from tipl.evaluation.results import Results
 from tipl.report.figures import figures, file_name, titles
 from tipl.report.tables import Table, cell, headline, label, tables
 from tipl.report.verdict import paragraphs, verdict
@@ -57,7 +57,7 @@ def places(page: str) -> list[Place]:
 
 
 def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> str:
-    """The page with its places of one source written anew.
+    """Return the page with its places of one source rewritten.
 
     Args:
         page: its text.
@@ -85,7 +85,7 @@ def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> 
     return _PLACE.sub(fill, page)
 
 
-def insert_markdown(results: dict[str, Any], source: Path, page: Path) -> None:
+def insert_markdown(results: Results, source: Path, page: Path) -> None:
     """Write every place of a result file in a Markdown page, and the pictures that it shows.
 
     Raises:
@@ -100,7 +100,7 @@ def insert_markdown(results: dict[str, Any], source: Path, page: Path) -> None:
     page.write_text(text, encoding="utf-8")
 
 
-def render(results: dict[str, Any], source: Path, section: str) -> str:
+def render(results: Results, source: Path, section: str) -> str:
     """One section as Markdown; nothing is drawn.
 
     Raises:
@@ -138,16 +138,16 @@ def _place(match: re.Match[str]) -> Place:
     )
 
 
-def _overview(results: dict[str, Any], _: Path) -> str:
-    (table,) = headline(results)
+def _overview(results: Results, _: Path) -> str:
+    table = headline(results)
     return "\n".join([*table_lines(table), "", verdict(results)])
 
 
-def _verdict(results: dict[str, Any], _: Path) -> str:
+def _verdict(results: Results, _: Path) -> str:
     return "\n".join(f"- {paragraph}" for paragraph in paragraphs(results))
 
 
-def _tables(results: dict[str, Any], _: Path) -> str:
+def _tables(results: Results, _: Path) -> str:
     found = tables(results)
     lines = []
     for table in sorted(found, key=lambda table: not table.main):
@@ -156,38 +156,39 @@ def _tables(results: dict[str, Any], _: Path) -> str:
         else:
             lines += [f"<details><summary>{table.title}</summary>", "", *table_lines(table)]
             lines += ["", "</details>", ""]
-    ahead = [label(name) for name, s in results["forecasters"].items() if not s["causal"]]
+    ahead = [label(name) for name, s in results.forecasters.items() if not s.causal]
     if ahead:
         lines.append(f"Not causal, they have seen the future of the run: {', '.join(ahead)}.")
     return "\n".join(lines).rstrip()
 
 
-def _figures(results: dict[str, Any], source: Path) -> str:
+def _figures(results: Results, source: Path) -> str:
     links = [f"![{title}]({source.stem}/{file_name(title)})" for title in titles(results)]
     return "\n\n".join(links)
 
 
-def _source(results: dict[str, Any], source: Path) -> str:
-    runs, starts = results["runs"], results["starts"]
+def _source(results: Results, source: Path) -> str:
+    runs, starts = results.runs, results.starts
     lines = [
-        f"- data: `{results['data']}`, version {results['version']}; {len(runs)} runs of its "
-        f"{results['split']} split: {', '.join(runs)}",
-        f"- starts: {starts['weights']:,} for weights, {starts['policies']:,} for policies",
+        f"- data: `{results.data}`, version {results.version}; {len(runs)} runs of its "
+        f"{results.split} split: {', '.join(runs)}",
+        f"- starts: {starts.weights:,} for weights, {starts.policies:,} for policies",
     ]
-    if results["modes"]:
+    if results.modes:
         lines[-1] += (
-            f", {starts['learning']:,} in the learning phase and {starts['plateau']:,} after it "
+            f", {starts.learning:,} in the learning phase and {starts.plateau:,} after it "
             "for returns"
         )
         lines.append(
-            f"- {results['episodes']} episodes for the return of a policy, the same starts for all"
+            f"- {results.episodes} episodes for the return of a policy, the same starts for all"
         )
-    if results["quick"]:
+    if results.quick:
         lines.append("- a quick look, with fewer starts and episodes")
-    return "\n".join([*lines, f"- made by `{results['command']}`", f"- all numbers: `{source}`"])
+    lines += [f"- left out: {run}: {why}" for run, why in results.left_out.items()]
+    return "\n".join([*lines, f"- made by `{results.command}`", f"- all numbers: `{source}`"])
 
 
-_SECTIONS: dict[str, Callable[[dict[str, Any], Path], str]] = {
+_SECTIONS: dict[str, Callable[[Results, Path], str]] = {
     "overview": _overview,
     "verdict": _verdict,
     "tables": _tables,
@@ -196,7 +197,7 @@ _SECTIONS: dict[str, Callable[[dict[str, Any], Path], str]] = {
 }
 
 
-def _draw(results: dict[str, Any], folder: Path) -> None:
+def _draw(results: Results, folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     for title, figure in figures(results).items():
         figure.savefig(folder / file_name(title), dpi=DPI)

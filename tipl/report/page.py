@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import jinja2
 
+from tipl.evaluation.results import Results
 from tipl.report.figures import figures, file_name, svg
 from tipl.report.tables import cell, headline, label, tables
 from tipl.report.verdict import verdict
 
 
-def write_report(results: dict[str, Any], out: Path) -> Path:
-    """Write the page and the figures beside ``results.json``; returns the page's path."""
+def write_report(results: Results, out: Path) -> Path:
+    """Write the page and the figures beside ``results.json``; return the path of the page."""
     drawn = figures(results)
     for title, figure in drawn.items():
         figure.savefig(out / file_name(title), dpi=150)
@@ -22,7 +22,7 @@ def write_report(results: dict[str, Any], out: Path) -> Path:
     page = environment.get_template("report.html").render(
         results=results,
         verdict=verdict(results),
-        overview=headline(results)[0],
+        overview=headline(results),
         tables=tables(results),
         figures={title: svg(figure) for title, figure in drawn.items()},
         label=label,

@@ -11,7 +11,7 @@ Three bases, of one kind (``TemporalSVD``). They differ in what they have seen:
 
 from tipl.representation.embedded import Embedded, embed
 from tipl.representation.prefix import PrefixBases, PrefixTokens
-from tipl.representation.rows import Rows, Trajectory
+from tipl.representation.rows import RunOrRows
 from tipl.representation.svd import TemporalSVD, fit_run, fit_shared
 
 __all__ = [
@@ -19,8 +19,8 @@ __all__ = [
     "PrefixBases",
     "PrefixTokens",
     "Rows",
+    "RunOrRows",
     "TemporalSVD",
-    "Trajectory",
     "embed",
     "fit_run",
     "fit_shared",

@@ -29,7 +29,7 @@ from jaxtyping import Float
 
 from tipl.errors import RepresentationError
 from tipl.representation.gram import Band, Held
-from tipl.representation.rows import Stack, Trajectory, spans, weights_of
+from tipl.representation.rows import RunOrRows, Stack, matrix_of, spans
 from tipl.representation.svd import TemporalSVD, check_rank, signs_of
 
 Kind = Literal["displacements", "snapshots"]
@@ -68,7 +68,7 @@ class PrefixBases:
     True
     """
 
-    trajectory: Trajectory
+    trajectory: RunOrRows
     """The run."""
     rank: int
     """Directions d."""
@@ -84,7 +84,7 @@ class PrefixBases:
     @classmethod
     def fit(
         cls,
-        trajectory: Trajectory,
+        trajectory: RunOrRows,
         rank: int,
         *,
         kind: Kind = "displacements",
@@ -161,7 +161,7 @@ class PrefixBases:
             RepresentationError: as ``tokens``.
         """
         tokens = self.tokens(t)
-        rows = weights_of(self.trajectory)[tokens.first : t + 1]
+        rows = matrix_of(self.trajectory)[tokens.first : t + 1]
         mix = tokens.coefficients[: len(rows)].T / tokens.singular_values[:, None]
         components = np.empty((self.rank, rows.shape[1]))
         for span in spans(rows.shape[1]):

@@ -76,7 +76,7 @@ def _pass(
     image = np.empty((stack.shape[0], directions.shape[1]))
     back = None if last else np.zeros(directions.shape)
     energy = 0.0
-    for start, rows in stack.pieces(again=not first):
+    for start, rows in stack.pieces():
         if first:
             energy += squared_norm(rows)
         product = image[start : start + len(rows)]

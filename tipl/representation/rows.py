@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from tipl.errors import RepresentationError
+from tipl.runs import Rows, weights_of
 from weighttraj import Run
 
 PIECE_BYTES = 64 << 20
@@ -18,30 +19,13 @@ PIECE_BYTES = 64 << 20
 BLOCK = 4096
 """Parameters that are in memory as float64 at a time."""
 
-
-@runtime_checkable
-class Rows(Protocol):
-    """A matrix, (time, param), that is read when it is sliced: an array, a map, run.weights."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Snapshots and parameters."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Element type."""
-
-    def __getitem__(self, key: Any) -> Any:
-        """Rows of a slice (and, after a comma, columns)."""
-
-
-Trajectory = Run | Rows
+RunOrRows = Run | Rows
 """The snapshots of one run, time-ordered: the run, or the matrix of its weights."""
 
 
-def weights_of(trajectory: Trajectory) -> Rows:
-    """The matrix of a run's weights."""
-    return trajectory.weights if isinstance(trajectory, Run) else trajectory
+def matrix_of(trajectory: RunOrRows) -> Rows:
+    """Return the matrix of a run's weights."""
+    return weights_of(trajectory) if isinstance(trajectory, Run) else trajectory
 
 
 def spans(size: int) -> Iterator[slice]:
@@ -61,8 +45,8 @@ class Stack:
             together.
     """
 
-    def __init__(self, trajectories: Sequence[Trajectory], piece: int | None = None) -> None:
-        self._parts = [weights_of(t) for t in trajectories]
+    def __init__(self, trajectories: Sequence[RunOrRows], piece: int | None = None) -> None:
+        self._parts = [matrix_of(t) for t in trajectories]
         self._places = [t.path if isinstance(t, Run) else None for t in trajectories]
         blocks = [t.info.block if isinstance(t, Run) else 1 for t in trajectories]
         shapes = [part.shape for part in self._parts]
@@ -98,14 +82,8 @@ class Stack:
         """Where the runs lie; None: they are arrays."""
         return ", ".join(str(place) for place in self._places if place) or None
 
-    def pieces(
-        self, *, again: bool = False
-    ) -> Iterator[tuple[int, Float[np.ndarray, "row param"]]]:
-        """Each piece, and the number of its first row in the stack.
-
-        Args:
-            again: the rows were read before, so they are not compared with the digests of their
-                snapshots again, which takes half the time. Chunks are always compared with theirs.
+    def pieces(self) -> Iterator[tuple[int, Float[np.ndarray, "row param"]]]:
+        """Yield each piece, and the number of its first row in the stack.
 
         Raises:
             RepresentationError: a value is not finite.
@@ -116,10 +94,8 @@ class Stack:
             self._parts, self._places, self.lengths, self._steps, strict=True
         ):
             for start in range(0, n, step):
-                key = slice(start, start + step)
-                rows = np.asarray(part[key, :] if again else part[key], self.dtype)
-                if not again:
-                    check_finite(rows, start, place)
+                rows = np.asarray(part[start : start + step], self.dtype)
+                check_finite(rows, start, place)
                 yield first + start, rows
             first += n
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from tipl.errors import RepresentationError
 from tipl.representation.randomised import leading
-from tipl.representation.rows import Stack, Trajectory
+from tipl.representation.rows import RunOrRows, Stack
 
 EXACT_WORK = 10**9
 """Smaller side squared times larger side, up to which ``fit_run`` and ``fit_shared`` take the
@@ -56,7 +56,7 @@ class TemporalSVD:
     @classmethod
     def fit_streamed(
         cls,
-        trajectory: Trajectory,
+        trajectory: RunOrRows,
         rank: int,
         *,
         oversampling: int = 32,
@@ -116,7 +116,7 @@ class TemporalSVD:
         """Weights phi~ = u S V^T."""
         return np.asarray((coefficients * self.singular_values) @ self.components)
 
-    def coefficients(self, trajectory: Trajectory) -> Float[np.ndarray, "time rank"]:
+    def coefficients(self, trajectory: RunOrRows) -> Float[np.ndarray, "time rank"]:
         """Coefficients of a whole trajectory, read a piece at a time."""
         pieces = Stack([trajectory]).pieces()
         return np.concatenate([self.transform(rows) for _, rows in pieces])
@@ -126,7 +126,7 @@ class TemporalSVD:
         """Share of the squared norm of the weights in the first 1, 2, ..., d directions."""
         return np.cumsum(self.singular_values**2) / self.total_energy
 
-    def reconstruction_error(self, trajectory: Trajectory) -> float:
+    def reconstruction_error(self, trajectory: RunOrRows) -> float:
         """Mean squared error of the weights after a round trip through d coefficients.
 
         In squared units of a weight; read a piece at a time.
@@ -140,7 +140,7 @@ class TemporalSVD:
         return total / (stack.shape[0] * stack.shape[1])
 
 
-def fit_run(trajectory: Trajectory, rank: int, *, seed: int = 0) -> TemporalSVD:
+def fit_run(trajectory: RunOrRows, rank: int, *, seed: int = 0) -> TemporalSVD:
     """Basis of a run: exact up to ``EXACT_WORK``, else streamed with the defaults.
 
     Raises:
@@ -149,7 +149,7 @@ def fit_run(trajectory: Trajectory, rank: int, *, seed: int = 0) -> TemporalSVD:
     return fit_shared([trajectory], rank, seed=seed)
 
 
-def fit_shared(trajectories: Sequence[Trajectory], rank: int, *, seed: int = 0) -> TemporalSVD:
+def fit_shared(trajectories: Sequence[RunOrRows], rank: int, *, seed: int = 0) -> TemporalSVD:
     """One basis for several runs: of their snapshots one below the other.
 
     Expect it to fail on other runs. Each run begins at its own initialisation and goes its own

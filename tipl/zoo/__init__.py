@@ -1,7 +1,1 @@
-"""Released models: they come with the package, or from the hub, and are loaded by name."""
-
-from tipl.zoo.lookup import load, names
-from tipl.zoo.metrics import Metrics
-from tipl.zoo.remote import push
-
-__all__ = ["Metrics", "load", "names", "push"]
+"""Released models: what is known of them, their cards, and how they are published."""

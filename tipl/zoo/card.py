@@ -6,8 +6,8 @@ section brings its heading, so that what was not measured leaves no empty one.
 
 | section | what it says |
 |---|---|
-| ``summary`` | data, cadence, runs that it learnt from and was judged on |
-| ``ladder`` | its figures beside the copy's, the floor's and the best baselines' |
+| ``summary`` | data, cadence, runs that it was trained and evaluated on |
+| ``baselines`` | its figures beside those of persistence, the oracle and the best baselines |
 | ``checks`` | the five checks |
 | ``training`` | settings and the error while it was trained |
 | ``commands`` | how the results were made |
@@ -20,21 +20,18 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import msgspec
 from matplotlib.figure import Figure
 
+from tipl import registry
 from tipl.errors import ModelError
 from tipl.report.figures import svg
 from tipl.report.markdown import rewrite, table_lines
-from tipl.report.scores import COPY, MODELS, floors, row_at, rows_of
-from tipl.report.tables import COLUMNS, cell, headline, label
+from tipl.report.scores import PERSISTENCE, oracles, row_at, wpe
+from tipl.report.tables import headline, label
 from tipl.report.verdict import verdict
-from tipl.zoo import lookup
 from tipl.zoo.metrics import Metrics, read_metrics
 
-HEADLINE = ("skill, h = 1", "skill, h = 10", "gain, h = 50")
-"""Columns that sum a model up."""
-_COMMANDS = {"tipl": "train", "gate": "train-gate", "causal": "train-causal"}
-"""What trains each kind."""
 _TESTS = {
     "null": "random walks: skill is 0",
     "causality": "the future moves no bit",
@@ -43,18 +40,6 @@ _TESTS = {
     "scale": "steps twice as long",
     "drift": "a straight line",
 }
-
-
-def listed(name: str, *, interval: bool = True) -> tuple[str, ...]:
-    """A line of ``tipl zoo``: name, kind, causal, data set, and the figures of ``HEADLINE``."""
-    folder = lookup.MODELS / name
-    metrics = read_metrics(folder)
-    if metrics is None:
-        return (name, lookup.kind_of(folder), *["-"] * (2 + len(HEADLINE)))
-    rows = [row_at(metrics.scores, *COLUMNS[column]) for column in HEADLINE]
-    figures = [cell(row, interval=interval) for row in rows]
-    causal = "yes" if metrics.causal else "no"
-    return (name, metrics.kind, causal, metrics.results["data"], *figures)
 
 
 def write_card(name: str, out: Path) -> Path:
@@ -68,7 +53,7 @@ def write_card(name: str, out: Path) -> Path:
         The card.
 
     Raises:
-        ModelError: there is no such model, or it was not judged.
+        ModelError: there is no such model, or it was not evaluated.
     """
     metrics = metrics_of(name)
     out.mkdir(parents=True, exist_ok=True)
@@ -84,13 +69,13 @@ def metrics_of(name: str) -> Metrics:
     """What is known of a released model.
 
     Raises:
-        ModelError: there is no such model, or it was not judged.
+        ModelError: there is no such model, or it was not evaluated.
     """
-    metrics = read_metrics(lookup.MODELS / name) if name in lookup.names() else None
+    metrics = read_metrics(registry.MODELS / name) if name in registry.names() else None
     if metrics is None:
         raise ModelError(
             "there is no released model of this name with results",
-            expected=", ".join(lookup.names()) or "a released model",
+            expected=", ".join(registry.names()) or "a released model",
             got=name,
             do="release it: `tipl release FOLDER --name NAME --results RESULTS`",
         )
@@ -108,7 +93,7 @@ def new_card(metrics: Metrics) -> str:
 
 
 def refreshed(card: str, metrics: Metrics) -> str:
-    """The card with its places written anew."""
+    """Return the card with its places rewritten."""
     return rewrite(card, "facts", metrics.name, lambda section: facts(metrics, section))
 
 
@@ -130,7 +115,7 @@ def facts(metrics: Metrics, section: str) -> str:
 
 
 def training_figure(metrics: Metrics) -> Figure:
-    """Errors against batches; of WPE, beside what the copy and the floor reach one step ahead."""
+    """Return a figure of errors against batches; WPE beside persistence and the oracle at h = 1."""
     fig = Figure(figsize=(7, 3.6), layout="constrained")
     axes = fig.subplots()
     for key, name, color in (
@@ -143,13 +128,13 @@ def training_figure(metrics: Metrics) -> Figure:
         if lines:
             x, y = ([line[k] for line in lines] for k in ("batch", key))
             axes.plot(x, y, label=name, color=color, lw=1.5)
-    measured = "wpe" if "wpe" in metrics.log[-1] else "error over the copy's"
-    beside = ((COPY, "-"), *((floor, "--") for floor in floors(metrics.results)))
+    measured = "wpe" if "wpe" in metrics.log[-1] else "error over that of persistence"
+    beside = ((PERSISTENCE, "-"), *((oracle, "--") for oracle in oracles(metrics.results)))
     for name, style in beside if measured == "wpe" else ():
-        row = row_at(metrics.results["forecasters"][name], ("wpe",), 1)
-        if row is not None and row["value"]:
-            text = f"{label(name)}, h = 1, runs it was judged on"
-            axes.axhline(row["value"], ls=style, color="#7f8c8d", lw=1, label=text)
+        row = row_at(metrics.results.forecasters[name], wpe, 1)
+        if row is not None and row.value:
+            text = f"{label(name)}, h = 1, evaluated runs"
+            axes.axhline(row.value, ls=style, color="#7f8c8d", lw=1, label=text)
     axes.set_xscale("log")
     if measured == "wpe":
         axes.set_yscale("log")
@@ -167,7 +152,7 @@ def _summary(metrics: Metrics) -> str:
     for trained in metrics.trained_on:
         made = " by ".join(x for x in (trained.environment, trained.algorithm) if x)
         lines += [
-            f"- learnt from: `{trained.data}`, version {trained.version}, "
+            f"- trained on: `{trained.data}`, version {trained.version}, "
             f"{len(trained.runs)} runs: {', '.join(trained.runs)}",
             f"- policies: {trained.parameters:,} parameters{f', {made}' if made else ''}",
         ]
@@ -176,24 +161,22 @@ def _summary(metrics: Metrics) -> str:
     return "\n".join(
         [
             *lines,
-            f"- judged on: `{results['data']}`, version {results['version']}, "
-            f"{len(results['runs'])} {results['split']} runs: {', '.join(results['runs'])}",
+            f"- evaluated on: `{results.data}`, version {results.version}, "
+            f"{len(results.runs)} {results.split} runs: {', '.join(results.runs)}",
         ]
     )
 
 
-def _ladder(metrics: Metrics) -> str:
-    (table,) = headline(metrics.results)
-    own = metrics.results | {
-        "forecasters": {n: metrics.results["forecasters"][n] for n in (COPY, metrics.judged_as)}
-    }
-    told = verdict(own) if metrics.kind in MODELS else ""
+def _baselines(metrics: Metrics) -> str:
+    table, results = headline(metrics.results), metrics.results
+    own = {name: results.forecasters[name] for name in (PERSISTENCE, metrics.evaluated_as)}
+    alone = msgspec.structs.replace(results, forecasters=own)
+    told = verdict(alone) if registry.is_model(metrics.kind) else ""
     note = (
         "95 % intervals: bootstrap over runs; what another training would give is not in them. "
-        "Skill: 0 is the copy of the last weights, 1 the truth. Of the baselines the best ones are "
-        "shown."
+        "Skill: 0 is persistence, 1 the truth. Of the baselines the best ones are shown."
     )
-    if metrics.results["modes"]:
+    if results.modes:
         note += (
             " Gain: of the return that training earns in h snapshots, with the exploration noise "
             "of the start."
@@ -289,13 +272,13 @@ def _errors(metrics: Metrics) -> str:
     after = f"After {last['batch']:,.0f} batches, "
     if key == "error":
         return after + (
-            "the squared error over the copy's, a mean over starts and horizons, is "
+            "the squared error over that of persistence, a mean over starts and horizons, is "
             f"{' and '.join(found)}. The state that is best on validation runs is kept."
         )
-    copy = rows_of(metrics.results["forecasters"][COPY], ("wpe",))[0]
+    first = metrics.results.forecasters[PERSISTENCE].wpe[0]
     return after + (
-        f"WPE is {' and '.join(found)}; the copy's, h = {copy['h']}, on the runs that it was "
-        f"judged on, is {copy['value']:.3g}."
+        f"WPE is {' and '.join(found)}; that of persistence, h = {first.h}, on the evaluated "
+        f"runs, is {first.value or 0:.3g}."
     )
 
 
@@ -303,17 +286,16 @@ def _commands(metrics: Metrics) -> str:
     commands = []
     given = {what: " ".join(map(_option, x.items())) for what, x in _settings(metrics).items()}
     data = " ".join(trained.data for trained in metrics.trained_on)
+    kind = registry.kinds().get(metrics.kind)
     if metrics.trained_on and metrics.kind == "drift":
         of_network, of_amplitudes = given.values()
         commands += [
-            f"tipl train-gate --data {data} --out GATE {of_network}",
-            f"tipl train-drift --along GATE --data {data} --out FOLDER {of_amplitudes}",
+            f"tipl train gate --data {data} --out GATE {of_network}",
+            f"tipl train scaled --along GATE --data {data} --out FOLDER {of_amplitudes}",
         ]
-    elif metrics.trained_on and metrics.kind in _COMMANDS:
-        commands.append(f"tipl {_COMMANDS[metrics.kind]} --data {data} --out FOLDER {given['']}")
-    elif metrics.trained_on:
-        commands.append(f"tipl fit {data} --out FOLDER {given['']}")
-    return "\n".join(["```bash", *commands, metrics.results["command"], "```"])
+    elif metrics.trained_on and kind is not None and kind.command:
+        commands.append(f"tipl train {kind.command} --data {data} --out FOLDER {given['']}")
+    return "\n".join(["```bash", *commands, metrics.results.command, "```"])
 
 
 def _option(setting: tuple[str, Any]) -> str:
@@ -326,7 +308,7 @@ def _option(setting: tuple[str, Any]) -> str:
 
 _SECTIONS: dict[str, Callable[[Metrics], str]] = {
     "summary": _summary,
-    "ladder": _ladder,
+    "baselines": _baselines,
     "checks": _checks,
     "training": _training,
     "commands": _commands,
@@ -334,9 +316,7 @@ _SECTIONS: dict[str, Callable[[Metrics], str]] = {
 
 
 __all__ = [
-    "HEADLINE",
     "facts",
-    "listed",
     "metrics_of",
     "new_card",
     "refreshed",

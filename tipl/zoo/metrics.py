@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from tipl.errors import ModelError
+from tipl.evaluation.results import Results, Scores, encoded
 
 FILE = "metrics.json"
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainedOn:
-    """The runs that a model learnt from."""
+    """The runs that a model was trained on."""
 
     data: str
     """Id of the data set."""
@@ -25,13 +25,13 @@ class TrainedOn:
     runs: tuple[str, ...]
     """Ids of the runs."""
     environment: str | None
-    """Id of the environment; None: not said."""
+    """Id of the environment; None: not recorded."""
     algorithm: str | None
-    """What trained the policies; None: not said."""
+    """Algorithm that trained the policies; None: not recorded."""
     every: int | None
-    """Gradient steps from one snapshot to the next; None: not said."""
+    """Number of gradient steps from one snapshot to the next; None: not recorded."""
     parameters: int
-    """Of one policy."""
+    """Number of parameters of one policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,34 +39,34 @@ class Metrics:
     """Everything that a card says in numbers."""
 
     name: str
-    """In the zoo."""
+    """Name in the zoo."""
     kind: str
     """Which forecaster it is."""
     causal: bool
     """Whether a forecast from t uses nothing that comes after t."""
     fingerprint: str
-    """Of the bytes that were judged, and that lie beside this file."""
-    judged_as: str
+    """SHA-256 of the files that were evaluated, and that lie beside this one."""
+    evaluated_as: str
     """Its name in ``results``."""
-    results: dict[str, Any]
-    """A result file, of those that matter and of the figures that matter."""
+    results: Results
+    """A result file, reduced to the forecasters and figures that a card shows."""
     trained_on: tuple[TrainedOn, ...] = ()
-    """What it learnt from, a data set each; empty: it was not trained by a command that says."""
+    """What it was trained on, one entry for each data set; empty: not recorded."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """Of the training."""
+    """Settings of the training."""
     log: list[dict[str, float]] = field(default_factory=list)
     """Some lines of the training's log: ``batch``, and errors on training and validation runs."""
     checks: dict[str, Any] | None = None
     """What ``tipl check`` wrote; None: not checked."""
 
     @property
-    def scores(self) -> dict[str, Any]:
-        """The model's own figures."""
-        return dict(self.results["forecasters"][self.judged_as])
+    def scores(self) -> Scores:
+        """Return the model's own figures."""
+        return self.results.forecasters[self.evaluated_as]
 
 
 def read_metrics(folder: Path) -> Metrics | None:
-    """What is known of the model in a folder; None: it was never judged.
+    """Return what is known of the model in a folder; None: it was never evaluated.
 
     Raises:
         ModelError: the file is damaged.
@@ -78,7 +78,7 @@ def read_metrics(folder: Path) -> Metrics | None:
         return msgspec.json.decode(file.read_bytes(), type=Metrics)
     except msgspec.DecodeError as error:
         raise ModelError(
-            "what is known of the model cannot be read",
+            "the metrics of the model cannot be read",
             expected=f"{FILE} as `tipl release` writes it",
             got=error,
             where=file,
@@ -88,7 +88,7 @@ def read_metrics(folder: Path) -> Metrics | None:
 
 def write_metrics(folder: Path, metrics: Metrics) -> None:
     """Put the file beside the model."""
-    (folder / FILE).write_text(json.dumps(asdict(metrics), indent=1) + "\n")
+    (folder / FILE).write_text(encoded(metrics), encoding="utf-8")
 
 
 __all__ = ["FILE", "Metrics", "TrainedOn", "read_metrics", "write_metrics"]

@@ -1,15 +1,15 @@
 """Puts a trained forecaster into the zoo, with what is known of it.
 
-What is released must be what was judged, byte for byte, and a model above 3 MB is rounded when it
-is released. So it goes in two steps, with the judging between them::
+What is released must be what was evaluated, byte for byte, and a model above 3 MB is rounded when
+it is released. So it goes in two steps, with the evaluation between them::
 
     tipl release FOLDER --name NAME
     tipl evaluate NAME ... --data DATA --out OUT
     tipl release FOLDER --name NAME --results OUT/results.json
 
 The first one puts the model into the zoo, rounded if it must be, as a draft without figures. It is
-judged there, by its name. The second one adds the figures, if the results say that they are of the
-bytes that lie in the zoo (``fingerprint``); a model that needs no rounding can be judged before.
+evaluated there, by its name. The second one adds the figures, if the results are those of the bytes
+in the zoo (``fingerprint``); a model that needs no rounding can be evaluated before.
 """
 
 from __future__ import annotations
@@ -22,24 +22,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import msgspec
 import numpy as np
 from safetensors.numpy import load_file, save
 
 import weighttraj as wt
-from tipl import baselines
+from tipl import registry
 from tipl.errors import ModelError
-from tipl.evaluation.parts import fingerprint
-from tipl.report.scores import (
-    FUNCTION_SKILL,
-    GAIN,
-    REPW,
-    SKILL,
-    floors,
-    read_results,
-    rows_of,
-    that_matter,
-)
-from tipl.zoo import lookup
+from tipl.evaluation.results import Results, Scores, read_results
+from tipl.report.scores import REPW, SKILL, function_skill, oracles, shown
+from tipl.saved import fingerprint
 from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics, write_metrics
 
 MOST = 3_000_000
@@ -75,12 +67,12 @@ def release(
     """Copy a forecaster into the zoo; with results, also what is known of it.
 
     Nothing in the zoo changes before all of it was found good. What was known of the same bytes
-    and is not given again stays: a model that lies in the zoo can be judged anew.
+    and is not given again stays: a model that lies in the zoo can be evaluated again.
 
     Args:
         folder: of the trained model; its train.json and log.jsonl are read, if they are there.
         name: in the zoo.
-        results: a results.json in which the model of the zoo was judged; None: a draft.
+        results: a results.json in which the model of the zoo was evaluated; None: a draft.
         checks: what ``tipl check`` wrote of it.
         log: keep some lines of the training's log.
 
@@ -92,40 +84,44 @@ def release(
             results or checks are of other bytes.
     """
     _check_name(name)
-    kind = lookup.kind_of(folder)
-    out = lookup.MODELS / name
+    out = registry.MODELS / name
     with TemporaryDirectory() as scratch:
         draft = Path(scratch) / name
         _copy(folder, draft)
-        forecaster = lookup.load(draft)
-        mark = fingerprint(forecaster)
-        known = read_metrics(out)
-        if known is not None and known.fingerprint != mark:
-            known = None  # of a model that was released before
-        metrics, checked = known, known.checks if known else None
-        if checks is not None:
-            checked = _checks(checks, mark, name)
-        if known is not None:
-            metrics = replace(known, checks=checked)
-        if results is not None:
-            document = read_results(results)
-            judged_as = _find(document, mark, name, results)
-            metrics = Metrics(
-                name=name,
-                kind=kind,
-                causal=forecaster.causal,
-                fingerprint=mark,
-                judged_as=judged_as,
-                results=reduced(document, judged_as),
-                **_training(folder, known, log),
-                checks=checked,
-            )
+        metrics = _metrics(folder, draft, results=results, checks=checks, log=log)
         shutil.copytree(draft, out, dirs_exist_ok=True)
     if metrics is None:
         (out / FILE).unlink(missing_ok=True)
     else:
         write_metrics(out, metrics)
     return out
+
+
+def _metrics(
+    folder: Path, draft: Path, *, results: Path | None, checks: Path | None, log: bool
+) -> Metrics | None:
+    """Return what is known of a model that is about to be released; None: it is a draft."""
+    name, forecaster = draft.name, registry.load(draft)
+    mark, known = fingerprint(forecaster), read_metrics(registry.MODELS / draft.name)
+    if known is not None and known.fingerprint != mark:
+        known = None  # metrics of a model that was released before
+    checked = known.checks if known else None
+    if checks is not None:
+        checked = _checks(checks, mark, name)
+    if results is None:
+        return replace(known, checks=checked) if known else None
+    document = read_results(results)
+    evaluated_as = _find(document, mark, name, results)
+    return Metrics(
+        name=name,
+        kind=registry.kind_in(folder),
+        causal=forecaster.causal,
+        fingerprint=mark,
+        evaluated_as=evaluated_as,
+        results=reduced(document, evaluated_as),
+        **_training(folder, known, log),
+        checks=checked,
+    )
 
 
 def _training(folder: Path, known: Metrics | None, log: bool) -> dict[str, Any]:
@@ -144,20 +140,25 @@ def _training(folder: Path, known: Metrics | None, log: bool) -> dict[str, Any]:
     }
 
 
-def reduced(results: dict[str, Any], judged_as: str) -> dict[str, Any]:
-    """A result file, of the forecasters and figures that matter: ``tipl.report`` reads it too."""
-    chosen = {judged_as, *that_matter(results), *floors(results)}
+def reduced(results: Results, evaluated_as: str) -> Results:
+    """Return results of the forecasters and figures that a card shows."""
+    chosen = {evaluated_as, *shown(results), *oracles(results)}
     forecasters = {
-        name: {
-            key: scores[key]
-            for key in ("kind", "causal", "floor", "wpe", "repw_ratio")
-            if key in scores
-        }
-        | _nested(scores)
-        for name, scores in results["forecasters"].items()
+        name: Scores(
+            kind=scores.kind,
+            causal=scores.causal,
+            is_oracle=scores.is_oracle,
+            wpe=scores.wpe,
+            repw_ratio=scores.repw_ratio,
+            skill={"ratio_of_sums": {"all": tuple(SKILL(scores))}} if scores.skill else {},
+            function_skill={"all": rows} if (rows := function_skill(scores)) else {},
+            gain={"held": scores.gain["held"]} if scores.gain.get("held") else {},
+            repw={"sampled": {"learning": tuple(REPW(scores))}} if REPW(scores) else {},
+        )
+        for name, scores in results.forecasters.items()
         if name in chosen
     }
-    return results | {"forecasters": forecasters}
+    return msgspec.structs.replace(results, forecasters=forecasters)
 
 
 def thinned(log: Path) -> list[dict[str, float]]:
@@ -171,7 +172,7 @@ def thinned(log: Path) -> list[dict[str, float]]:
 
 
 def _check_name(name: str) -> None:
-    if _NAME.fullmatch(name) is None or name in baselines.names():
+    if _NAME.fullmatch(name) is None or name in registry.unfitted():
         raise ModelError(
             "a model of the zoo cannot be called this",
             expected="lower-case letters, digits, dots and hyphens; no name of a baseline",
@@ -211,16 +212,16 @@ def _rounds(array: np.ndarray) -> bool:
     return array.ndim > 1 and array.dtype == np.float32
 
 
-def _find(results: dict[str, Any], mark: str, name: str, where: Path) -> str:
+def _find(results: Results, mark: str, name: str, where: Path) -> str:
     """What the model of these bytes is called in the results."""
-    marks = {n: s.get("fingerprint") for n, s in results["forecasters"].items()}
-    if results["split"] == "train" or mark not in marks.values():
+    marks = {n: s.fingerprint for n, s in results.forecasters.items()}
+    if results.split == "train" or mark not in marks.values():
         raise ModelError(
             "the results are not of this model on runs that it has not seen",
             expected=f"a forecaster of fingerprint {mark}, on the validation or test split",
-            got=f"{results['split']} split: {marks}",
+            got=f"{results.split} split: {marks}",
             where=where,
-            do="release it without results, judge what then lies in the zoo, "
+            do="release it without results, evaluate what then lies in the zoo, "
             f"`tipl evaluate {name} ...`, and give those results",
         )
     return next(str(n) for n, m in marks.items() if m == mark)
@@ -262,18 +263,6 @@ def _of_one(data: str, runs: dict[str, str]) -> TrainedOn:
         every=info.cadence.every if info.cadence else None,
         parameters=info.layout.size,
     )
-
-
-def _nested(scores: dict[str, Any]) -> dict[str, Any]:
-    """The rows that a card shows, where they stood."""
-    found: dict[str, Any] = {}
-    for path in (SKILL, FUNCTION_SKILL, GAIN, REPW):
-        if rows := rows_of(scores, path):
-            there = found
-            for key in path[:-1]:
-                there = there.setdefault(key, {})
-            there[path[-1]] = rows
-    return found
 
 
 def _json(file: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Models that are published at an address, on the Hugging Face hub or in an object store.
+"""Publishes models at an address, on the Hugging Face hub or in an object store.
 
 One address holds one model: what its folder does, ``config.json`` and ``safetensors``, and a card.
 Nothing in it is code, and nothing is unpickled.
@@ -6,53 +6,17 @@ Nothing in it is code, and nothing is unpickled.
 
 from __future__ import annotations
 
-import hashlib
-import os
 import shutil
 import tempfile
 from pathlib import Path
 
+from tipl import registry
 from tipl.errors import ForecastError
-from tipl.forecast import Forecaster
-from tipl.zoo import lookup
+from tipl.forecaster import Forecaster
 from tipl.zoo.card import write_card
 from weighttraj.format.catalog import write_manifest
-from weighttraj.registry.download import download_folder
 from weighttraj.registry.upload import repository_of, upload_folder
 from weighttraj.remote import RemotePath, hub
-
-FILES = ("*.json", "*.safetensors", "README.md")
-"""What is downloaded of a repository on the hub, whatever lies in it."""
-VARIABLE = "WEIGHTTRAJ_MODELS_PATH"
-"""Environment variable: folder for models from object stores. Default: ~/.weighttraj/models."""
-
-
-def fetch(address: str, revision: str | None = None) -> tuple[Path, str]:
-    """The folder of a model at an address, and its name.
-
-    It is downloaded once, and found without a network from then on.
-
-    Raises:
-        FileNotFoundError: there is no model at the address.
-        RegistryError: it is no address.
-        RemoteError: it cannot be reached.
-    """
-    place = RemotePath.parse(address, revision, kind="models")
-    if place.scheme != "hf":
-        home = Path(os.environ.get(VARIABLE, "~/.weighttraj/models")).expanduser()
-        folder = home / hashlib.sha256(place.repository.encode()).hexdigest()[:16] / place.name
-        if not folder.is_dir():  # it appears when it is whole, and what is published stays
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            download_folder(place, folder, needed=["config.json"])
-        return folder, place.name
-    root = place.root
-    try:
-        found = hub.client().snapshot_download(
-            root.host, revision=root.revision, allow_patterns=[*FILES]
-        )
-    except (OSError, ValueError, RuntimeError) as error:  # the client's errors are such
-        raise hub.hub_error(error, address) from error
-    return Path(found), place.name
 
 
 def push(
@@ -107,12 +71,12 @@ def _push_to_hub(folder: Path, place: RemotePath, private: bool) -> str:
 
 def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None:
     """The files of a model and its card, as they are published."""
-    folder = lookup.folder_of(model) if isinstance(model, str | Path) else None
-    released = folder is not None and folder.parent == lookup.MODELS
+    folder = registry.folder_of(model) if isinstance(model, str | Path) else None
+    released = folder is not None and folder.parent == registry.MODELS
     if folder is not None and released:
         shutil.copytree(folder, out)
     else:  # of a training only the model: its state, log and settings are of this machine
-        forecaster = lookup.load(model) if isinstance(model, str | Path) else model
+        forecaster = registry.load(model) if isinstance(model, str | Path) else model
         forecaster.save(out)
     if card is None and folder is not None and released:
         card = Path(__file__).parents[2] / "cards/models" / f"{folder.name}.md"
@@ -128,8 +92,8 @@ def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None
             expected="--card FILE, or README.md beside the model",
             got="none",
             where=model if isinstance(model, str | Path) else type(model).__name__,
-            do="write one: what it forecasts, what it learnt from, its figures, its limits",
+            do="write one: what it forecasts, what it was trained on, its figures, its limits",
         )
 
 
-__all__ = ["FILES", "VARIABLE", "fetch", "push"]
+__all__ = ["push"]

@@ -1,0 +1,1 @@
+"""The subcommands of ``tipl``; ``tipl.cli`` imports the one that is run."""

@@ -1,0 +1,141 @@
+"""``tipl evaluate``, ``tipl check`` and ``tipl report``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.markup import escape
+from rich.table import Table
+
+from tipl.checks.model import check_model
+from tipl.evaluation.config import EvaluateConfig
+from tipl.evaluation.results import Results, read_results
+from tipl.registry import load
+from tipl.report import tables
+from tipl.report.evaluate import evaluate as evaluate_all
+from tipl.report.markdown import insert_markdown
+from tipl.report.page import write_report
+from tipl.report.tables import cell, headline, label
+from tipl.report.verdict import verdict
+from weighttraj.remote.address import here, new_path
+from weighttraj.terminal import Output, say
+
+WIDE = 150
+"""Number of characters that a table with intervals needs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateCommand(EvaluateConfig):
+    """Evaluate forecasters on held-out runs beside persistence, and write a report."""
+
+    forecasters: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Folders of models and of fitted baselines; names of models of the zoo, or of baselines that
+    need no fit (``ema-0.95``, say); or classes, ``module:Class``."""
+    workers: int = 1
+    """Number of processes, each with one thread; each takes a run at a time."""
+    imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
+    """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
+
+
+def evaluate(args: EvaluateCommand) -> None:
+    """Evaluate forecasters on held-out runs beside persistence, and write a report."""
+    console = Output()
+    new_path(args.out)
+    forecasters = [load(name) for name in args.forecasters]
+    config = EvaluateConfig(
+        **{field.name: getattr(args, field.name) for field in fields(EvaluateConfig)}
+    )
+    results = evaluate_all(
+        forecasters, config, workers=args.workers, imports=args.imports, console=console
+    )
+    console.print(_table(results, console))
+    say(verdict(results))
+    say(f"report: {config.out / 'report.html'}")
+    if results.left_out:
+        for run, why in results.left_out.items():
+            Output(stderr=True).print(f"not evaluated: run {run}: {escape(why)}", soft_wrap=True)
+        sys.exit(1)
+
+
+def check(
+    model: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, a model of the zoo, or a baseline")
+    ],
+    data: Annotated[str, tyro.conf.arg(help="a data set; its first test run is used")],
+    out: Annotated[Path, tyro.conf.arg(help="a JSON file")],
+    horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="snapshots ahead")] = (1, 2, 5, 10),
+    null_batches: Annotated[int, tyro.conf.arg(help="batches of training on walks")] = 2_000,
+    null_walks: Annotated[
+        int, tyro.conf.arg(help="random walks: two are forecast, the others trained on")
+    ] = 12,
+    seed: Annotated[int, tyro.conf.arg(help="seed of walks, symmetries and that training")] = 0,
+) -> None:
+    """Run five tests that a causal forecaster should pass, and write what they measured.
+
+    Whether it finds something in random walks, looks ahead, follows permuted and flipped units and
+    longer steps, and goes on along a line.
+    """
+    if new_path(out).is_dir():
+        raise IsADirectoryError(f"--out {out} is a folder: name a JSON file")
+    found = check_model(
+        load(model),
+        data,
+        horizons=horizons,
+        batches=null_batches,
+        walks=null_walks,
+        seed=seed,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    for name, passed in found["passed"].items():
+        say(f"{name}: {'passes' if passed else 'fails'}, {found[name]}")
+
+
+def report(
+    results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a results.json")],
+    into: Annotated[
+        Path | None, tyro.conf.arg(help="rewrite the places of these results in a Markdown page")
+    ] = None,
+) -> None:
+    """Write the page and figures of a result file again, or its places in a Markdown page."""
+    document = read_results(here(results))
+    if into is not None:
+        insert_markdown(document, results, into)
+        say(f"results in {into}")
+    else:
+        say(f"report: {write_report(document, results.parent)}")
+
+
+def _table(results: Results, console: Output) -> Table:
+    """Return the overview; where there is no room, without intervals, and with fewer columns."""
+    overview = headline(results)
+    shown = range(len(overview.columns))
+    table = _overview(results, overview, shown, interval=console.width >= WIDE)
+    anything = console.options.update_width(1_000)  # else it measures what the console has
+    if console.measure(table, options=anything).minimum > console.width:
+        few = [i for i in shown if overview.columns[i].startswith(("skill", "gain"))]
+        table = _overview(results, overview, few, interval=False)
+        table.caption = "the report has more columns, and intervals"
+    return table
+
+
+def _overview(
+    results: Results, overview: tables.Table, shown: Iterable[int], *, interval: bool
+) -> Table:
+    table = Table(title=f"{results.data}, {results.split} runs: {', '.join(results.runs)}")
+    table.add_column("forecaster", no_wrap=True)
+    for i in shown:
+        table.add_column(overview.columns[i], justify="right")
+    for name, cells in overview.rows:
+        texts = (cell(cells[i], interval=interval) for i in shown)
+        table.add_row(label(name), *(escape(text) for text in texts))
+    return table
+
+
+__all__ = ["check", "evaluate", "report"]

@@ -1,0 +1,60 @@
+"""``tipl release``, ``tipl card`` and ``tipl push``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from tipl.zoo.card import write_card
+from tipl.zoo.metrics import read_metrics
+from tipl.zoo.release import release as release_model
+from tipl.zoo.remote import push as push_model
+from weighttraj.remote.address import here, new_path
+from weighttraj.terminal import say
+
+
+def release(
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="of a trained model")],
+    name: Annotated[str, tyro.conf.arg(help="in the zoo")],
+    results: Annotated[
+        Path | None, tyro.conf.arg(help="results.json that evaluated the model of the zoo")
+    ] = None,
+    checks: Annotated[Path | None, tyro.conf.arg(help="what `tipl check` wrote of it")] = None,
+    log: Annotated[bool, tyro.conf.arg(help="keep some lines of the training's log")] = True,
+) -> None:
+    """Put a model into the zoo: first as a draft, then with the results of its evaluation there."""
+    out = release_model(here(folder), name, results=results, checks=checks, log=log)
+    say(f"model in {out}")
+    if read_metrics(out) is None:
+        say(f"a draft: evaluate it with `tipl evaluate {name} ...`, then give --results")
+
+
+def card(
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="a model of the zoo")],
+    out: Annotated[Path, tyro.conf.arg(help="folder of the cards")] = Path("cards/models"),
+) -> None:
+    """Write the card of a model, or the figures of its metrics.json into the existing card."""
+    say(f"card in {write_card(name, new_path(out))}")
+
+
+def push(
+    model: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, or a model of the zoo")
+    ],
+    address: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(help="hf://organisation/name, or s3://bucket/name")
+    ],
+    private: Annotated[
+        bool, tyro.conf.arg(help="of a new repository: only its organisation sees it")
+    ] = False,
+    card: Annotated[
+        Path | None, tyro.conf.arg(help="its card; one of the zoo brings its own")
+    ] = None,
+) -> None:
+    """Publish a model with its card, on the Hugging Face hub or in an object store."""
+    say(f"published: {push_model(model, address, private=private, card=card)}")
+
+
+__all__ = ["card", "push", "release"]

@@ -1,0 +1,73 @@
+"""The reconstruction oracle: no forecast, but the truth as a basis of rank d shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from tipl.errors import ForecastError
+from tipl.forecaster import Forecaster, check_request
+from tipl.representation import embed
+from tipl.saved import read_config, write
+from weighttraj import Run
+
+
+@dataclass(frozen=True)
+class Reconstruction(Forecaster):
+    """The truth, phi_{t+h}, after a round trip through d coefficients: an oracle, no forecast.
+
+    A model that predicts coefficients in the basis of the whole run cannot have a smaller error.
+    """
+
+    rank: int
+    """Rank of the basis."""
+    kind = "reconstruction"
+    causal = False
+    is_oracle = True
+
+    @property
+    def name(self) -> str:
+        """Name in tables and figures."""
+        return f"reconstruction-{self.rank}"
+
+    def forecast(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Float32[np.ndarray, "start horizon param"]:
+        """Return phi_{t+h} projected to the first d directions of the run.
+
+        Raises:
+            ForecastError: the run ends before.
+        """
+        check_request(run, starts, horizons)
+        if max(starts) + max(horizons) >= len(run):
+            raise ForecastError(
+                "the run ends before, so the truth is not known",
+                expected=f"start and horizon of at most {len(run) - 1} together",
+                got=max(starts) + max(horizons),
+                where=run.path,
+            )
+        embedded = embed(run, self.rank)
+        later = np.asarray(starts)[:, None] + np.asarray(horizons)
+        back = embedded.svd.inverse_transform(embedded.coefficients[later])
+        return back.astype(np.float32)
+
+    def save(self, path: str | Path) -> None:
+        """Write config.json."""
+        write(path, {"kind": self.kind, "rank": self.rank})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Reconstruction:
+        """Read the rank.
+
+        Raises:
+            FileNotFoundError: there is no forecaster in the folder.
+            ModelError: the folder holds another one.
+        """
+        return read_config(path, cls.kind, cls)
+
+
+__all__ = ["Reconstruction"]

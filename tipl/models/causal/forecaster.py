@@ -1,0 +1,100 @@
+"""The trained network as a forecaster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+
+from tipl.errors import RepresentationError
+from tipl.forecaster import check_cadence, check_request
+from tipl.horizons import rows_of
+from tipl.models.causal.data import SCALE_STEPS, bases_of, local_scale, view
+from tipl.models.causal.network import CausalConfig, CausalGPT
+from tipl.runs import weights_of
+from tipl.saved import SavedNetwork
+from tipl.structure import Clock
+from tipl.threads import threads
+from weighttraj import Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class CausalModelConfig:
+    """What a saved one says of itself."""
+
+    network: CausalConfig
+    """Sizes of the network."""
+    every: int | None
+    """Gradient steps from one snapshot to the next in the training runs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Causal(SavedNetwork[CausalGPT, CausalModelConfig]):
+    """tipl-causal: phi_t and a displacement within the directions of the path up to t.
+
+    Before the path has as many directions as the basis, and where the run has stopped moving, it
+    falls back to persistence. Its error is at least the part of the true displacement that leaves
+    the path's directions.
+    """
+
+    name: str = "tipl-causal"
+    kind = "causal"
+    causal = True
+    config_type = CausalModelConfig
+
+    @classmethod
+    def build(cls, config: CausalModelConfig) -> CausalGPT:
+        """Return an untrained network."""
+        return CausalGPT(config.network)
+
+    @torch.no_grad()
+    def forecast(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Float32[np.ndarray, "start horizon param"]:
+        """Return phi_t and what the network adds to it.
+
+        Raises:
+            ForecastError: it was not trained for such a horizon.
+            ModelError: the run has another cadence, or longer iterations.
+        """
+        check_request(run, starts, horizons)
+        sizes, weights = self.config.network, weights_of(run)
+        places = rows_of(sizes.horizons, horizons, self.name)
+        check_cadence(run, self.config.every, sizes.phases)
+        clock = Clock.of(run)
+        out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
+        self.network.eval()
+        with threads():
+            for place, t in enumerate(starts):
+                out[place] = weights[t]
+                moved = self._displacement(run, t, clock)
+                if moved is not None:
+                    out[place] += moved[places]
+        return out
+
+    def _displacement(
+        self, run: Run, t: int, clock: Clock
+    ) -> Float[np.ndarray, "horizon param"] | None:
+        """Return the displacement from a start at each horizon; None: there is no basis yet."""
+        sizes = self.config.network
+        if t < sizes.rank:
+            return None
+        recent = weights_of(run)[max(0, t - SCALE_STEPS) : t + 1].astype(np.float64)
+        scale = local_scale(recent)
+        if scale == 0:
+            return None
+        bases = bases_of(run, sizes)
+        try:
+            prefix = bases.tokens(t)
+        except RepresentationError:  # too few directions
+            return None
+        seen = view(prefix, t, scale, clock, sizes)
+        names = ("tokens", "phases", "mask", "state")
+        moved = self.network(*(seen[name][None] for name in names))[0]  # (horizon, rank)
+        return np.asarray((moved.numpy() * scale) @ bases.basis(t).components)
+
+
+__all__ = ["Causal", "CausalModelConfig"]

@@ -1,0 +1,150 @@
+"""Trains tipl-gate on the training runs of one or several data sets; minutes on one core."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from rich.console import Console
+from torch import Tensor
+
+import weighttraj as wt
+from tipl.checks.copies import RefitConfig, as_dataset
+from tipl.errors import TrainError
+from tipl.horizons import fitted
+from tipl.models.gate.data import GateExamples, examples_of
+from tipl.models.gate.forecaster import Gate, GateModelConfig
+from tipl.models.gate.network import GateConfig, GateNetwork
+from tipl.settings import check_settings
+from tipl.training import LoopConfig, train_network
+from tipl.training.config import flat
+from tipl.training.starts import Example, StartsConfig, StartsLearner
+
+NETWORK = GateConfig()
+LOOP = LoopConfig(n_batches=4_000, batch_size=32, learning_rate=3e-3)
+"""Minutes on one core."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateTrainConfig(StartsConfig):
+    """One training of tipl-gate. A start in a batch has 128 parameters."""
+
+    network: GateConfig = NETWORK
+    """Sizes of the network."""
+    training: LoopConfig = LOOP
+    """How the network is trained."""
+
+    def check(self) -> None:
+        """Refuse numbers that make no training or no network."""
+        super().check()
+        least = dict.fromkeys(("horizons", "lags", "width", "experts"), 1) | {"phases": 0}
+        check_settings(vars(self.network), least, TrainError)
+        if len(self.network.betas) < 3 or not all(0 <= beta < 1 for beta in self.network.betas):
+            raise TrainError(
+                "the network cannot average steps like this",
+                expected="at least three betas, each from 0 to below 1",
+                got=self.network.betas,
+                do="change --betas, or leave it out",
+            )
+
+
+def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
+    """Train tipl-gate, or go on where the training stopped; load it if the training has ended.
+
+    The same seed gives the same model on the same machine.
+
+    Raises:
+        TrainError: the data sets have no runs to train on, or different cadences; or as
+            ``train_network``.
+    """
+    config.check()
+    train_network(
+        lambda *_: GateLearner(config),
+        config.training,
+        config.out,
+        GateLearner.settings,
+        defaults=flat(config),
+        console=console,
+    )
+    return Gate.load(config.out)
+
+
+class GateLearner(StartsLearner[GateExamples]):
+    """The network of tipl-gate, its examples and its loss."""
+
+    network: GateNetwork
+
+    def __init__(self, config: GateTrainConfig) -> None:
+        super().__init__(config, fitted(config.network.horizons))
+        sizes = replace(
+            config.network,
+            horizons=fitted(config.network.horizons),
+            phases=config.network.phases or self.phases,
+        )
+        self.model_config = GateModelConfig(network=sizes, every=self.every)
+        self.network = GateNetwork(sizes)
+
+    def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
+        """Return the examples of one run."""
+        return examples_of(run, self.model_config.network, self.config.starts, rng)
+
+    def collate(self, found: Sequence[Example]) -> GateExamples:
+        """Put examples together."""
+        return GateExamples.of(found)
+
+    def loss(
+        self, network: Callable[..., Tensor], batch: GateExamples
+    ) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
+        """Return the summed relative error, and the number of known cells."""
+        return relative_error(network, batch)
+
+    def save(self, out: Path) -> None:
+        """Write the model."""
+        Gate(self.network, self.model_config).save(out)
+
+
+def relative_error(
+    network: Callable[..., Tensor], examples: GateExamples
+) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
+    """Return squared error over mean squared displacement, summed over starts and horizons.
+
+    Returns:
+        the sum, and how many starts and horizons are known.
+    """
+    moved = network(
+        examples.inputs.float(), examples.contexts.float(), examples.basis.float(), examples.tensor
+    ).float()  # (start, param, horizon)
+    known = examples.energy.isfinite() & (examples.energy > 0)
+    target = examples.target.float().nan_to_num()
+    squared = ((moved - target).square() * examples.weight[..., None]).sum(1)
+    ratio = squared / torch.where(known, examples.energy, 1)  # (start, horizon)
+    return (ratio * known).sum(), known.sum().clamp(min=1)
+
+
+def refit(old: Gate, runs: Sequence[wt.Run], config: RefitConfig) -> Gate:
+    """Train a network of the same sizes on other runs, for the null check.
+
+    A quarter of the runs choose which state is kept.
+    """
+    loop = replace(
+        LOOP,
+        n_batches=config.batches,
+        save_every=max(1, config.batches // 20),
+        seed=config.seed,
+    )
+    network = replace(old.config.network, horizons=config.horizons, phases=0)
+    return train_gate(
+        GateTrainConfig(
+            data=(as_dataset(runs, config.folder / "walks", validation=len(runs) // 4),),
+            out=config.folder / "refit",
+            network=network,
+            training=loop,
+        )
+    )
+
+
+__all__ = ["GateLearner", "GateTrainConfig", "refit", "relative_error", "train_gate"]

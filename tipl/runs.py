@@ -1,0 +1,156 @@
+"""How models read runs: through the decoded memory map of ``weighttraj.load``.
+
+A run is decoded and checked once, into a file that all processes map; every later reading is a
+slice of that map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+
+from tipl.errors import LeftOutWarning
+from weighttraj import Run
+from weighttraj.load import CachedWeights
+
+BLOCK_BYTES = 2**27
+"""Bytes of the rows that are read at once when columns are picked."""
+HUGE = 1e15
+"""Weights beyond this are not forecast: squares of their steps leave the range of float32."""
+
+
+@runtime_checkable
+class Rows(Protocol):
+    """A matrix (time, param) that is read when it is sliced: an array or a memory map."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Snapshots and parameters."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Element type."""
+
+    def __getitem__(self, key: Any, /) -> Any:
+        """Rows of a slice (and, after a comma, columns)."""
+
+
+def weights_of(run: Run) -> Float32[np.ndarray, "time param"]:
+    """Return the weights of a run: a read-only memory map, decoded when it is first needed.
+
+    A run that is still being collected grows, and each of its states would be another file in the
+    cache. So the snapshots that it has are read into memory instead.
+
+    Raises:
+        CacheError: the cache's folder cannot be used.
+        DamageError: the run is damaged.
+    """
+    if run not in _KNOWN:
+        complete = run.info.status == "complete"
+        _KNOWN[run] = CachedWeights(run) if complete else np.asarray(run.weights[:], np.float32)
+    known = _KNOWN[run]
+    return known.map() if isinstance(known, CachedWeights) else known
+
+
+def checksum_of(run: Run) -> str:
+    """Return the SHA-256 (hex) of the checksums of a run's snapshots: equal weights, equal sum."""
+    if run not in _CHECKSUMS:
+        _CHECKSUMS[run] = hashlib.sha256(run["digest"][:].tobytes()).hexdigest()
+    return _CHECKSUMS[run]
+
+
+@contextmanager
+def cache_in(folder: Path) -> Iterator[None]:
+    """Decode runs into another cache for a while: those of a test, say, that soon are deleted."""
+    before = os.environ.get("WEIGHTTRAJ_CACHE")
+    os.environ["WEIGHTTRAJ_CACHE"] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["WEIGHTTRAJ_CACHE"]
+        else:
+            os.environ["WEIGHTTRAJ_CACHE"] = before
+
+
+def stratified(
+    tensor: Int[np.ndarray, " param"], limit: int, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, " some"], Float[np.ndarray, " some"]]:
+    """Draw about ``limit`` parameters, some of each tensor, and how many each stands for.
+
+    Each tensor has a share by its size; small ones have at least half of an equal share.
+    """
+    size, tensors = len(tensor), int(tensor.max()) + 1
+    chosen, counts = [], []
+    for number in range(tensors):
+        mine = np.flatnonzero(tensor == number)
+        share = max(limit * len(mine) // size, limit // (2 * tensors), 1)
+        some = np.sort(rng.permutation(mine)[:share]) if size > limit else mine
+        chosen.append(some)
+        counts.append(np.full(len(some), len(mine) / len(some)))
+    return np.concatenate(chosen), np.concatenate(counts)
+
+
+def columns_of(weights: Rows, columns: np.ndarray) -> Float32[np.ndarray, "time some"]:
+    """Return some columns of all rows, read block by block."""
+    rows = max(1, BLOCK_BYTES // (4 * weights.shape[1]))
+    blocks = [weights[a : a + rows][:, columns] for a in range(0, weights.shape[0], rows)]
+    return np.ascontiguousarray(np.concatenate(blocks))
+
+
+def fault_of(weights: Rows) -> str | None:
+    """Return why nothing can be forecast of these weights, in words; None: they are fine."""
+    rows = max(1, BLOCK_BYTES // (4 * max(1, weights.shape[1])))
+    moving = False
+    for first in range(0, weights.shape[0], rows):
+        block = np.asarray(weights[first : first + rows])
+        bad = ~np.isfinite(block).all(axis=1)
+        if bad.any():
+            return f"NaN or infinity in snapshot {first + int(bad.argmax())}"
+        large = np.abs(block).max(axis=1, initial=0) > HUGE
+        if large.any():
+            return f"a weight beyond {HUGE:g} in snapshot {first + int(large.argmax())}"
+        moving = moving or bool((block != weights[0]).any())
+    return None if moving else "its weights never change"
+
+
+def without_faults(
+    runs: Sequence[Run], fault: Callable[[Run], str | None]
+) -> tuple[list[Run], dict[str, str]]:
+    """Leave out the runs that have a fault, with a warning that names each.
+
+    Returns:
+        The other runs; and the faults, by the id of the run.
+    """
+    kept, faults = [], {}
+    for run in runs:
+        if (why := fault(run)) is None:
+            kept.append(run)
+        else:
+            faults[run.id] = why
+            warnings.warn(f"run {run.id} is left out: {why}", LeftOutWarning, stacklevel=3)
+    return kept, faults
+
+
+_KNOWN: WeakKeyDictionary[Run, CachedWeights | np.ndarray] = WeakKeyDictionary()
+_CHECKSUMS: WeakKeyDictionary[Run, str] = WeakKeyDictionary()
+
+__all__ = [
+    "Rows",
+    "cache_in",
+    "checksum_of",
+    "columns_of",
+    "fault_of",
+    "stratified",
+    "weights_of",
+    "without_faults",
+]

@@ -1,0 +1,253 @@
+"""Trainings on starts of runs: what a model sees at a snapshot, and what followed.
+
+Each start counts with its own relative error, the squared error over the squared displacement, so
+that 1 is persistence. Every data set has an equal share of each batch.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+from torch import Tensor
+
+import weighttraj as wt
+from tipl.errors import RepresentationError, TrainError
+from tipl.horizons import too_short
+from tipl.runs import checksum_of, fault_of, weights_of, without_faults
+from tipl.settings import check_settings
+from tipl.training.config import LoopConfig, flat
+from tipl.training.loop import Examples, Learner
+from weighttraj.progress import LoggedProgress
+
+LOOK_AT = 64
+"""Number of validation examples that are looked at together."""
+
+Example = dict[str, Tensor]
+"""One start: tensors by name, among them ``energy`` (horizon,), the squared displacement, which is
+NaN where the run ends before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartExamples(Examples):
+    """Base of the examples that are starts of runs."""
+
+    group: Int[Tensor, " start"]
+    """Number of the data set, from 0, rising."""
+
+
+E = TypeVar("E", bound=StartExamples)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartsConfig:
+    """One training on starts of runs."""
+
+    data: tuple[str | Path, ...]
+    """Data sets: paths or ids. The training split of each is trained on, in equal shares; the
+    runs of the validation split choose which state is kept."""
+    out: Path
+    """Folder of the model. A training that stopped goes on from its last checkpoint."""
+    starts: int = 600
+    """Number of starts of each run that are trained on, about."""
+    training: LoopConfig
+    """How the network is trained."""
+
+    def check(self) -> None:
+        """Refuse numbers that make no training.
+
+        Raises:
+            TrainError: a number is too small.
+        """
+        check_settings(vars(self), {"starts": 1}, TrainError)
+
+
+class StartsLearner(Learner[E]):
+    """Base of the learners that are trained on starts: it reads the runs and draws the batches."""
+
+    def __init__(self, config: StartsConfig, horizons: Sequence[int]) -> None:
+        self.config, self.horizons = config, horizons
+        datasets = [wt.open_dataset(data) for data in config.data]
+        self.train = [dataset.split("train").runs for dataset in datasets]
+        self.held_out = [
+            [run for run in dataset if run.split == "validation"] for dataset in datasets
+        ]
+        self.every, self.phases = cadence_of([run for group in self.train for run in group])
+
+    @abstractmethod
+    def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
+        """Return the examples of one run."""
+
+    @abstractmethod
+    def collate(self, found: Sequence[Example]) -> E:
+        """Put examples together, the first axis of every tensor being the start."""
+
+    def settings(self) -> dict[str, Any]:
+        """Return what train.json says of the training."""
+        runs = [{run.id: checksum_of(run) for run in group} for group in self.train]
+        return flat(self.config) | {"runs": runs}
+
+    def prepare(self, console: Console) -> None:
+        """Read the examples of the training runs and of the validation runs.
+
+        Raises:
+            TrainError: no run can be trained on, or none is long enough for each horizon.
+        """
+        examples = self._gather(self.train, console)
+        if examples is None:
+            raise too_short(self.horizons)
+        self._examples = examples
+        self._validation = self._gather(self.held_out, console) if any(self.held_out) else None
+        group = examples.group.numpy()
+        self._groups = np.unique(group)
+        self._ends = np.searchsorted(group, [*self._groups, self._groups[-1] + 1])
+
+    def batch(self, n: int) -> E:
+        """Return random starts; each data set is as likely as any other."""
+        training = self.config.training
+        rng = np.random.default_rng([training.seed, n])
+        chosen = rng.integers(len(self._groups), size=training.batch_size)
+        first, sizes = self._ends[chosen], np.diff(self._ends)[chosen]
+        rows = first + (rng.uniform(size=training.batch_size) * sizes).astype(np.int64)
+        return self._examples[torch.from_numpy(rows)]
+
+    def validation(self) -> Sequence[E]:
+        """Return all examples of the validation runs, in parts."""
+        held_out = self._validation
+        if held_out is None:
+            return ()
+        return [held_out[i : i + LOOK_AT] for i in range(0, len(held_out), LOOK_AT)]
+
+    def _gather(self, groups: Sequence[Sequence[wt.Run]], console: Console) -> E | None:
+        columns = (TextColumn("reading runs"), BarColumn(), MofNCompleteColumn())
+        with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
+            bar = progress.add_task("", total=sum(map(len, groups)))
+            found = gather(
+                groups,
+                self.examples_of,
+                seed=self.config.training.seed,
+                progress=lambda _: progress.advance(bar),
+            )
+        reached = [one["energy"].isfinite() for one in found]
+        if not reached or not torch.stack(reached).any(0).all():
+            return None
+        return self.collate(found)
+
+
+def gather(
+    groups: Sequence[Sequence[wt.Run]],
+    examples_of: Callable[[wt.Run, np.random.Generator], Iterable[Example]],
+    *,
+    seed: int,
+    progress: Callable[[wt.Run], None] = lambda _: None,
+) -> list[Example]:
+    """Return the examples of the runs of each data set; leave out runs that have none.
+
+    Args:
+        groups: the runs of each data set.
+        examples_of: returns the examples of one run.
+        seed: seed of starts and parameters.
+        progress: progress callback, called with each run that was read.
+
+    Raises:
+        TrainError: there are runs, and none can be trained on.
+    """
+    found: list[Example] = []
+    faults: dict[str, str] = {}
+    for group, runs in enumerate(groups):
+        for number, run in enumerate(runs):
+            mine: list[Example] = []
+
+            def fault(run: wt.Run, group: int = group, number: int = number) -> str | None:
+                rng = np.random.default_rng([seed, group, number])
+                return _examples_or_fault(run, rng, examples_of, mine)  # noqa: B023
+
+            faults |= without_faults([run], fault)[1]
+            place = {"group": torch.tensor(group)}
+            found += [one | place for one in mine]
+            progress(run)
+    if faults and len(faults) == sum(map(len, groups)):
+        raise TrainError(
+            "none of the runs can be trained on",
+            expected="runs of at least 3 snapshots, with finite weights that change",
+            got="; ".join(f"{run}: {why}" for run, why in faults.items()),
+            do="collect other runs for this split",
+        )
+    return found
+
+
+def _examples_or_fault(
+    run: wt.Run,
+    rng: np.random.Generator,
+    examples_of: Callable[[wt.Run, np.random.Generator], Iterable[Example]],
+    found: list[Example],
+) -> str | None:
+    """Append the examples of a run; return why there are none, in words."""
+    if (why := fault_in_training(run)) is not None:
+        return why
+    try:
+        found.extend(examples_of(run, rng))
+    except RepresentationError as error:
+        found.clear()
+        return error.message.partition("\n")[0]
+    return None if found else "no start of it can be trained on"
+
+
+def fault_in_training(run: wt.Run) -> str | None:
+    """Return why no start of a run can be trained on, in words; None: some can."""
+    if len(run) < 3:
+        return f"it has {len(run)} snapshots, and a start needs one before and one after it"
+    return fault_of(weights_of(run))
+
+
+def cadence_of(runs: Sequence[wt.Run]) -> tuple[int | None, int]:
+    """Return the gradient steps from one snapshot to the next, and the snapshots of an iteration.
+
+    Raises:
+        TrainError: the runs differ.
+    """
+    cadences = {run.info.cadence.every if run.info.cadence else None for run in runs}
+    if len(cadences) != 1:
+        raise TrainError(
+            "the runs have different cadences",
+            expected="one number of gradient steps from one snapshot to the next",
+            got=sorted(map(str, cadences)),
+            do="train on runs of one cadence",
+        )
+    phases = (int(run.phase.max(initial=-1)) + 1 for run in runs)
+    return cadences.pop(), max(phases)
+
+
+def draw_starts(length: int, count: int, rng: np.random.Generator) -> list[int]:
+    """Return starts from 1 to the last but one, each once.
+
+    Half of them are drawn evenly in time and half on a logarithmic scale, because the learning
+    phase is short.
+    """
+    last = length - 2
+    if last < 1:
+        return []
+    u = rng.uniform(size=count)
+    even, early = 1 + u * last, np.exp(u * np.log(last + 1))
+    drawn = np.where(np.arange(count) % 2, even, early).astype(int)
+    return np.unique(np.clip(drawn, 1, last)).tolist()  # type: ignore[no-any-return]
+
+
+__all__ = [
+    "Example",
+    "StartExamples",
+    "StartsConfig",
+    "StartsLearner",
+    "cadence_of",
+    "draw_starts",
+    "fault_in_training",
+    "gather",
+]
