@@ -7,7 +7,9 @@ import re
 import unicodedata
 
 _PLAIN = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9.]+)+")
-_MARKUP = re.compile(r"([\\`*\[\]<>|~&$@:!]|(?<!\w)_|_(?!\w)|(?<=www)\.)", re.IGNORECASE)
+_MARKUP = re.compile(
+    r"([\\`*\[\]<>|~&$!]|:(?=//)|(?<=\S)@(?=\S)|(?<!\w)_|_(?!\w)|(?<=www)\.)", re.IGNORECASE
+)
 
 
 def printable(text: object, *, lines: bool = False) -> str:

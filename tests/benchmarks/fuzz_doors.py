@@ -246,9 +246,7 @@ def fuzz(samples: Path, seed: int, first: int, n: int) -> Result:
         name = rng.choice(list(CASES))
         sample, file, change, doors = CASES[name]
         with tempfile.TemporaryDirectory(dir=samples.parent) as folder:
-            path = Path(folder) / Path(sample).name
-            copy = shutil.copytree if (samples / sample).is_dir() else shutil.copyfile
-            copy(samples / sample, path)
+            path = copied(samples / sample, Path(folder))
             change(path / file if file else path, rng)
             if name not in ("manifest", "list bytes") and path.is_dir() and sample == "default":
                 write_manifest(path)  # as whoever changes it can
@@ -258,6 +256,12 @@ def fuzz(samples: Path, seed: int, first: int, n: int) -> Result:
                 if why:
                     result.broken.append(f"case {case}, {name}, {door}: {why}")
     return result
+
+
+def copied(sample: Path, folder: Path) -> Path:
+    """A copy of a sample in a folder."""
+    copy = shutil.copytree if sample.is_dir() else shutil.copyfile
+    return Path(copy(sample, folder / sample.name))
 
 
 def _through(door: Door, path: Path) -> tuple[str, str]:

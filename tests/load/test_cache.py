@@ -203,13 +203,18 @@ KILLED_WHEN_IT_WRITES = """
 import os, signal, sys
 import weighttraj as wt
 from weighttraj.format import reader
-from weighttraj.load import CachedWeights, cache
+from weighttraj.load import CachedWeights
 reader.PIECE_BYTES = 1
-def kill_at(frame, event, arg):
-    if frame.f_code.co_name == "_write" and frame.f_locals["file"].tell() > 10_000_000:
-        os.kill(os.getpid(), signal.SIGKILL)
-sys.setprofile(kill_at)
-cache.CachedWeights(wt.open_run(sys.argv[1])).map()
+pieces = CachedWeights._pieces
+def kill_at(self):
+    written = 0
+    for piece in pieces(self):
+        if written > 10_000_000:
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield piece
+        written += piece.nbytes
+CachedWeights._pieces = kill_at
+CachedWeights(wt.open_run(sys.argv[1])).map()
 """
 
 

@@ -282,7 +282,11 @@ def _shards_fit(document: dict[str, Any], outer: list[int]) -> bool:
 
 
 def _codec_names(codecs: list[dict[str, Any]]) -> Iterator[str]:
+    if not isinstance(codecs, list):
+        raise TypeError(f"codecs that are no list: {codecs!r:.100}")
     for codec in codecs:
         yield codec["name"]
         inner = codec.get("configuration", {})
+        if any(not isinstance(inner.get(key, []), list) for key in ("codecs", "index_codecs")):
+            raise TypeError(f"codecs that are no list: {inner!r:.100}")
         yield from _codec_names([*inner.get("codecs", []), *inner.get("index_codecs", [])])

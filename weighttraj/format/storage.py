@@ -210,7 +210,7 @@ def read_metadata(objects: Objects) -> Metadata:
             raise FormatError(
                 "the run's metadata do not have the checksum of each chunk",
                 expected=f"{expected} hexadecimal digits",
-                got=tag if tag is None else f"{len(tag)} characters",
+                got=f"{len(tag)} characters" if isinstance(tag, str) else repr(tag),
                 where=f"{objects.path}, {name}",
                 do="restore the run from a copy",
             )

@@ -154,7 +154,7 @@ def read_table(folder: Path, name: str, rows: int) -> pa.Table:
                 table = _decoded(table, text, limit)
             if len(table) != rows:
                 raise ValueError(f"{len(table)} rows")
-            return table
+            return table.replace_schema_metadata(None)  # what pandas wrote there is not needed
     except (pa.ArrowException, ValueError, OSError, MemoryError, UnicodeDecodeError) as error:
         raise DamageError(
             "a table of the data set is damaged, or not what it should be",
