@@ -8,7 +8,7 @@ import unicodedata
 
 _PLAIN = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9.]+)+")
 _MARKUP = re.compile(
-    r"([\\`*\[\]<>|~&$!]|:(?=//)|(?<=\S)@(?=\S)|(?<!\w)_|_(?!\w)|(?<=www)\.)", re.IGNORECASE
+    r"([\\`*<>|~&$]|\](?=[(\[])|:(?=//)|(?<=\S)@(?=\S)|(?<!\w)_|(?<=www)\.)", re.IGNORECASE
 )
 
 
@@ -35,7 +35,7 @@ def markdown(text: object) -> str:
     r"""Escape text for one line of Markdown: no link, no HTML, no cell of a table begins in it.
 
     >>> markdown("n_steps <b>[x](y)|")
-    'n_steps \\<b\\>\\[x\\](y)\\|'
+    'n_steps \\<b\\>[x\\](y)\\|'
     """
     return _MARKUP.sub(r"\\\1", printable(text))
 
