@@ -456,7 +456,9 @@ def test_a_gate_is_released_with_its_data_sets(
     text = write_card("tipl-gate-small", tmp_path / "cards").read_text()
     assert "datasets:\n- small\n- other\n" in text
     assert text.count("- trained on: ") == 2
-    assert "tipl train gate --data small other --out FOLDER --starts 20 --horizons 1 5" in text
+    assert "tipl train gate --data small other --out FOLDER --starts 20 --n-batches 4" in text
+    assert " --horizons 1 5 " in text
+    assert "None" not in text
     assert " --no-adam " in text
     assert "After 4 batches, the squared error over that of persistence" in text
     assert (tmp_path / "cards/tipl-gate-small.svg").exists()

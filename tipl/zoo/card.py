@@ -238,7 +238,7 @@ def _training(metrics: Metrics) -> str:
 
 def _settings(metrics: Metrics) -> dict[str, dict[str, Any]]:
     """Of the training, and of that of the network before it."""
-    own = {key: value for key, value in metrics.settings.items() if value != []}
+    own = {k: value for k, value in metrics.settings.items() if value not in ([], None)}
     before = own.pop("of_gate", {})
     return {" of the network": before, " of the amplitudes": own} if before else {"": own}
 
