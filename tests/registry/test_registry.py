@@ -151,7 +151,7 @@ def test_what_pandas_would_read_in_a_table_besides_its_columns_does_not_matter(s
     file = store / "small/tables/runs.parquet"
     table = pq.read_table(file)
     pq.write_table(table.replace_schema_metadata({"pandas": "{}"}), file)  # pandas: KeyError
-    assert len(search("seed == 1")) == 1
+    assert len(search("dataset == 'small' and seed == 1")) == 1
 
 
 # New ones of old ones
