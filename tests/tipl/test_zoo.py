@@ -459,7 +459,7 @@ def test_a_gate_is_released_with_its_data_sets(
     assert "tipl train gate --data small other --out FOLDER --starts 20 --n-batches 4" in text
     assert " --horizons 1 5 " in text
     assert "None" not in text
-    assert " --no-adam " in text
+    assert " --no-adam\n" in text
     assert "After 4 batches, the squared error over that of persistence" in text
     assert (tmp_path / "cards/tipl-gate-small.svg").exists()
     assert listed("tipl-gate-small")[1:3] == ("gate", "yes")
