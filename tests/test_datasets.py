@@ -13,8 +13,10 @@ import weighttraj as wt
 from tests.pages import run_page
 from tests.small import SMALL_RECIPE
 from weighttraj.collect import read_recipe
-from weighttraj.collect.population import check_config
+from weighttraj.collect.agents import actor_parameters
+from weighttraj.collect.population import Origin, check_config
 from weighttraj.collect.recipe import SPLITS
+from weighttraj.learning import learning_phase
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(ROOT.glob("datasets/*/recipe.toml"))
@@ -26,9 +28,9 @@ SHORTER = {" = 40_960": f" = {SHORT}", "=40_960": "=256"}
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "tests/benchmarks"))
-    return importlib.import_module("bench_recipes")
+def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "datasets"))
+    return importlib.import_module("pages")
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.parent.name)
@@ -39,16 +41,16 @@ def test_a_recipe_can_be_collected(path: Path) -> None:
         check_config(recipe.ppo)
 
 
-def test_the_table_is_fresh(bench: ModuleType) -> None:
-    assert bench.insert(PAGE) == PAGE, "run: python tests/benchmarks/bench_recipes.py --table"
+def test_the_table_is_fresh(pages: ModuleType) -> None:
+    assert pages.insert(PAGE) == PAGE, "run: python datasets/pages.py"
     stale = PAGE.replace("| 71,948 |", "| 71,949 |")
-    assert bench.insert(stale) == PAGE != stale
+    assert pages.insert(stale) == PAGE != stale
 
 
-def test_sizes_of_a_recipe_are_those_of_its_runs(bench: ModuleType, small_dataset: Path) -> None:
+def test_sizes_of_a_recipe_are_those_of_its_runs(pages: ModuleType, small_dataset: Path) -> None:
     run = wt.open(small_dataset).runs[0]
-    assert bench.snapshots_of(SMALL_RECIPE) == len(run)
-    assert bench.parameters_of(SMALL_RECIPE) == run.layout.size
+    assert SMALL_RECIPE.n_snapshots == len(run)
+    assert pages.parameters_of(SMALL_RECIPE) == run.layout.size
 
 
 @pytest.mark.parametrize(
@@ -56,10 +58,10 @@ def test_sizes_of_a_recipe_are_those_of_its_runs(bench: ModuleType, small_datase
     [("inverted-pendulum-v4-ppo-v1", 122, 1951), ("half-cheetah-v4-ppo-v1", 71_948, 4881)],
 )
 def test_sizes_of_the_papers_recipes(
-    bench: ModuleType, name: str, parameters: int, snapshots: int
+    pages: ModuleType, name: str, parameters: int, snapshots: int
 ) -> None:
     recipe = read_recipe(ROOT / "datasets" / name / "recipe.toml")
-    assert (bench.parameters_of(recipe), bench.snapshots_of(recipe)) == (parameters, snapshots)
+    assert (pages.parameters_of(recipe), recipe.n_snapshots) == (parameters, snapshots)
 
 
 def test_every_block_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,6 +78,8 @@ def test_every_block_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monkey
 # What lies in this repository
 
 RELEASED = sorted(path.parent for path in ROOT.glob("datasets/*/data/dataset.json"))
+SUITE = [path for path in RELEASED if "16x16" in path.parent.name]
+WITH_FACTS = sorted(path.parent for path in ROOT.glob("datasets/*/facts.json"))
 
 
 @pytest.mark.parametrize("path", RELEASED, ids=lambda path: path.parent.name)
@@ -83,10 +87,44 @@ def test_a_released_data_set_is_whole(path: Path) -> None:
     dataset = wt.open(path.parent.name)
     recipe = read_recipe(path.parent / "recipe.toml")
     assert dataset.info.status == "complete"
-    assert {run.info.seed: run.split for run in dataset} == recipe.splits()
-    assert wt.verify(path, deep=True) == []
+    splits = {run.info.seed: run.split for run in dataset}
+    assert splits.items() <= recipe.splits().items()
+    part = f"{len(splits)} of {len(recipe.splits())}"
+    assert dataset.info.part == (part if len(splits) < len(recipe.splits()) else "")
+    assert wt.verify(path) == []
     assert wt.lint(path) == []
     assert sum(file.stat().st_size for file in path.rglob("*")) < 60e6
+
+
+def test_the_suite_fits_into_a_clone() -> None:
+    assert len(SUITE) == 6
+    files = [file for path in SUITE for file in path.rglob("*")]
+    assert sum(file.stat().st_size for file in files) < 110e6
+
+
+@pytest.mark.parametrize("path", SUITE, ids=lambda path: path.parent.name)
+def test_every_task_can_be_trained_and_evaluated_from_a_clone(path: Path) -> None:
+    dataset = wt.open(path.parent.name)
+    counts = {name: len(dataset.split(name)) for name in SPLITS}
+    assert (counts["train"] >= 4, counts["validation"] >= 1, counts["test"] >= 4) == (True,) * 3
+    for run in dataset:
+        assert run.weights.shape[0] == read_recipe(path.parent / "recipe.toml").n_snapshots
+        deterministic, sampled = (run.mean_return(deterministic=mode) for mode in (True, False))
+        assert run.returns.shape == (len(run), 20)
+        for means in (deterministic, sampled):
+            rows = np.flatnonzero(np.isfinite(means))
+            assert {0, len(run) - 1} <= set(rows.tolist())
+            assert {*range(0, learning_phase(sampled) + 1, 10)} <= set(rows.tolist())
+
+
+@pytest.mark.parametrize("path", SUITE, ids=lambda path: path.parent.name)
+def test_a_run_of_every_task_begins_with_the_weights_that_its_seed_makes(path: Path) -> None:
+    run = wt.open(path.parent.name).split("test").runs[0]
+    origin = Origin(read_recipe(path.parent / "recipe.toml").ppo, seed=run.info.seed or 0)
+    weights = np.concatenate(
+        [p.detach().numpy().ravel() for p in actor_parameters(origin.model.policy).values()]
+    )
+    np.testing.assert_array_equal(run.weights[0], weights)
 
 
 def test_the_released_pendulums_are_at_the_papers_scale() -> None:
@@ -102,10 +140,20 @@ def test_the_released_pendulums_are_at_the_papers_scale() -> None:
             assert set(np.flatnonzero(np.isfinite(means)).tolist()) == evaluated
 
 
+@pytest.mark.parametrize("path", WITH_FACTS, ids=lambda path: path.name)
+def test_the_page_says_what_was_measured(path: Path, pages: ModuleType) -> None:
+    recipe, facts = read_recipe(path / "recipe.toml"), pages.facts_of(path.name)
+    assert (path / "README.md").read_text() == pages.render(recipe, facts), (
+        "run: python datasets/pages.py"
+    )
+    assert (path / "curves.svg").is_file()
+
+
 @pytest.mark.parametrize("path", RELEASED, ids=lambda path: path.parent.name)
-def test_the_facts_are_fresh(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "tests/benchmarks"))
-    facts = importlib.import_module("facts")
-    page = (path.parent / "README.md").read_text()
-    told = f"run: python tests/benchmarks/facts.py {path.parent.name}"
-    assert facts.insert(page, wt.open(path)) == page, told
+def test_the_facts_are_those_of_the_runs_in_the_repository(path: Path, pages: ModuleType) -> None:
+    facts, dataset = pages.facts_of(path.parent.name), wt.open(path)
+    assert facts.here.runs == {name: len(dataset.split(name)) for name in SPLITS}
+    assert facts.steps == dataset.runs[0].num_timesteps[-1]
+    if facts.collected is None:  # then the means are those of the runs here
+        last = np.mean([run.mean_return(deterministic=True)[-1] for run in dataset])
+        assert facts.final["deterministic"].mean == pytest.approx(last, abs=0.06)

@@ -7,8 +7,6 @@ the paper's. The learning rate is annealed over the short length. For each: envi
 second from the seeds to the packed runs, size of a packed run, returns of the first and the last
 training episodes, what `verify` and `lint` find; and from that, linear in steps and in snapshots,
 what the whole recipe will take.
-
-python tests/benchmarks/bench_recipes.py --table    # rewrites the table in datasets/README.md
 """
 
 from __future__ import annotations
@@ -29,14 +27,9 @@ from results import save
 
 import weighttraj as wt
 from weighttraj.collect import Recipe, collect, read_recipe
-from weighttraj.collect.agents import actor_parameters
-from weighttraj.collect.population import Origin
 from weighttraj.collect.rollouts import Environments
 
 RECIPES = Path(__file__).parents[2] / "datasets"
-PAGE = RECIPES / "README.md"
-START = "<!-- recipes: rewrite with `python tests/benchmarks/bench_recipes.py --table` -->"
-END = "<!-- end of the recipes -->"
 PAPERS = ("half-cheetah-v4-ppo-v1", "inverted-pendulum-v4-ppo-v1")
 EPISODES = 10
 
@@ -74,7 +67,7 @@ def measure(whole: Recipe, iterations: int, folder: Path) -> dict[str, Any]:
     if problems:
         raise SystemExit("\n".join([f"{whole.id} is not whole:", *problems]))
     runs = dataset.runs
-    assert {len(run) for run in runs} == {snapshots_of(recipe)}
+    assert {len(run) for run in runs} == {recipe.n_snapshots}
     steps_per_cpu_s = len(runs) * config.total_timesteps / cpu_s
     whole_steps = len(runs) * whole.ppo.n_iterations * whole.ppo.n_steps
     return {
@@ -88,7 +81,7 @@ def measure(whole: Recipe, iterations: int, folder: Path) -> dict[str, Any]:
         "last_returns": mean_return(returns, slice(-EPISODES, None)),
         "findings": Counter(f"{found.check}: {found.message}" for found in wt.lint(folder)),
         "whole_cpu_hours": round(whole_steps / steps_per_cpu_s / 3600, 2),
-        "whole_gb": round(size * snapshots_of(whole) / snapshots_of(recipe) / 1e9, 3),
+        "whole_gb": round(size * whole.n_snapshots / recipe.n_snapshots / 1e9, 3),
     }
 
 
@@ -97,46 +90,8 @@ def mean_return(returns: Returns, episodes: slice) -> float:
     return round(float(np.mean([np.mean(each[episodes]) for each in returns.values()])), 1)
 
 
-def snapshots_of(recipe: Recipe) -> int:
-    """Snapshots of each run, the first and the last included."""
-    steps = recipe.ppo.n_iterations * recipe.ppo.gradient_steps_per_iteration
-    return 1 + -(-steps // recipe.store.every)
-
-
-def parameters_of(recipe: Recipe) -> int:
-    """Parameters of a snapshot."""
-    policy = Origin(recipe.ppo, seed=0).model.policy
-    return sum(parameter.numel() for parameter in actor_parameters(policy).values())
-
-
 def recipe_files() -> list[Path]:
     return sorted(RECIPES.glob("*/recipe.toml"))
-
-
-def render() -> str:
-    """The table of all recipes."""
-    lines = [
-        "| id | environment | network | parameters | steps of a run | seeds | snapshots of a run "
-        "| data in the repository |",
-        "|---|---|---:|---:|---:|---:|---:|---|",
-    ]
-    for file in recipe_files():
-        recipe = read_recipe(file)
-        is_here = (file.parent / "data/dataset.json").is_file()
-        lines.append(
-            f"| [{recipe.id}]({file.relative_to(RECIPES)}) | {recipe.ppo.env_id} "
-            f"| {'x'.join(map(str, recipe.ppo.net_arch))} | {parameters_of(recipe):,} "
-            f"| {recipe.ppo.total_timesteps:,} | {len(recipe.splits())} "
-            f"| {snapshots_of(recipe):,} | {'yes' if is_here else 'no'} |"
-        )
-    return "\n".join(lines)
-
-
-def insert(page: str) -> str:
-    """The page with the table as the recipes have it."""
-    before, rest = page.split(START)
-    _, after = rest.split(END)
-    return f"{before}{START}\n\n{render()}\n\n{END}{after}"
 
 
 def main() -> None:
@@ -146,11 +101,7 @@ def main() -> None:
     parser.add_argument("ids", nargs="*", help="folders in datasets/")
     parser.add_argument("--iterations", type=int, default=20, help="rollouts of each seed")
     parser.add_argument("--save", action="store_true", help="keep the figures in results.json")
-    parser.add_argument("--table", action="store_true", help="only rewrite datasets/README.md")
     args = parser.parse_args()
-    if args.table:
-        PAGE.write_text(insert(PAGE.read_text()))
-        return
     ids = args.ids or [file.parent.name for file in recipe_files()]
     recipes = {name: read_recipe(RECIPES / name / "recipe.toml") for name in ids}
     cases = {}

@@ -39,6 +39,12 @@ class Recipe:
     store: Store = field(default_factory=Store)
     """What is stored."""
 
+    @property
+    def n_snapshots(self) -> int:
+        """Number of snapshots of each run, the first and the last included."""
+        steps = self.ppo.n_iterations * self.ppo.gradient_steps_per_iteration
+        return 1 + -(-steps // self.store.every)
+
     def splits(self) -> dict[int, str]:
         """Return the split of each seed.
 

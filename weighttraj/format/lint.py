@@ -130,6 +130,7 @@ def _weights(run: Run) -> Iterator[tuple[str, str]]:
         last = last.copy()  # the piece need not stay in memory
     if bad:
         yield "finite", f"NaN or infinite weights at {_some(bad)}"
+    moved |= _behind_silent_inputs(run)
     if len(run) > 1 and not moved.all():
         names = [s.name for s in run.layout.params if not moved[s.slice].all()]
         still = int((~moved).sum())
@@ -147,6 +148,23 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
         with np.errstate(invalid="ignore"):  # infinite weights are a finding of their own
             total += float(((one[part].astype(np.float64) - other[part]) ** 2).sum())
     return math.sqrt(total)
+
+
+def _behind_silent_inputs(run: Run) -> np.ndarray:
+    """Return which parameters multiply an observation that is always 0: these cannot move.
+
+    Reacher-v4 and InvertedDoublePendulum-v4 have such observations. The normaliser shows them: its
+    mean is exactly 0 at every snapshot, and its variance has shrunk to almost nothing.
+    """
+    behind = np.zeros(run.layout.size, bool)
+    stats, layers = run.info.obs_norm, run.info.policy.layers
+    if stats is None or len(stats.shape) != 1 or not layers or not len(run):
+        return behind
+    silent = (run["obs_norm/mean"][:] == 0).all(axis=0) & (run["obs_norm/var"][-1] < 1e-3)
+    for spec in run.layout.params:
+        if spec.name == layers[0][0] and spec.shape[-1:] == silent.shape:
+            behind[spec.slice] = np.broadcast_to(silent, spec.shape).reshape(-1)
+    return behind
 
 
 def _jumps(lengths: np.ndarray) -> list[int]:
