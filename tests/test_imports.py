@@ -129,6 +129,11 @@ ALLOWED = {
     ],
     "weighttraj.format.lint": ["weighttraj.format.reader", REMOTE],
     "weighttraj.format.locate": ["weighttraj.remote"],
+    "weighttraj.format.overview": [
+        "weighttraj.errors",
+        "weighttraj.format.schema",
+        "weighttraj.text",
+    ],
     "weighttraj.format.reader": [
         "weighttraj.text",
         "weighttraj.errors",
@@ -137,6 +142,7 @@ ALLOWED = {
         "weighttraj.format.layout",
         "weighttraj.format.locate",
         "weighttraj.format.objects",
+        "weighttraj.format.overview",
         "weighttraj.format.schema",
         "weighttraj.format.storage",
         REMOTE,

@@ -577,7 +577,19 @@ def test_splits_are_by_run(small_dataset: Path) -> None:
     assert [run.info.seed for run in dataset.split("test")] == [2, 3]
     with pytest.raises(FormatError, match="expected: one of \\['test', 'train'\\]"):
         dataset.split("validation")
-    assert "4 runs" in repr(dataset)
+    assert dataset[0] is dataset["seed0000"]
+    assert dataset[-1].seed == 3
+
+
+def test_a_data_set_is_seen_at_a_glance(small_dataset: Path) -> None:
+    dataset = wt.open(small_dataset)
+    lines = repr(dataset).splitlines()
+    assert len(lines) <= 12
+    told = dict(line.split(maxsplit=1) for line in lines[1:])
+    assert told["runs"] == "4 runs: 2 train, 2 test"
+    assert told["training"] == "PPO on InvertedPendulum-v4"
+    assert "weights float32 (time 49, param 122), one every 2 gradient steps" in repr(dataset)
+    assert "<td style='text-align:left'>4 runs: 2 train, 2 test</td>" in dataset._repr_html_()
 
 
 def test_a_data_set_is_not_opened_as_a_run(small_dataset: Path) -> None:

@@ -361,7 +361,7 @@ def test_a_part_says_what_it_is_of_and_keeps_recipe_splits_and_bytes(
     assert part.info.id == whole.info.id
     assert part.info.part == f"{len(kept)} of {len(whole)}"
     assert not whole.info.part
-    assert f"({len(kept)} of {len(whole)} runs of the whole)" in repr(part)
+    assert f"{len(kept)} of {len(whole)} runs of the whole" in repr(part)
     assert wt.verify(tmp_path / "part", deep=True) == []
     assert wt.lint(tmp_path / "part") == wt.lint(small_dataset)
     for run, original in zip(part, kept, strict=True):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from weighttraj.errors import DamageError, FormatError, RegistryError, RowError
+from weighttraj.format import overview
 from weighttraj.format.catalog import DATASET, parse_dataset, read_dataset_info
 from weighttraj.format.codecs import BLOCK_BYTES
 from weighttraj.format.layout import ParamLayout
@@ -205,6 +206,11 @@ class Run:
     def id(self) -> str:
         """Id, unique in the data set."""
         return self._entry.id if self._entry else self.info.run_id
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the training; None: not recorded."""
+        return self.info.seed
 
     @property
     def layout(self) -> ParamLayout:
@@ -490,20 +496,28 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.runs)
 
-    def __getitem__(self, run_id: str) -> Run:
-        """The run of an id."""
-        for run in self.runs:
-            if run.id == run_id:
-                return run
-        raise KeyError(f"no run {run_id!r}; there are {[run.id for run in self.runs]}")
+    def __getitem__(self, run: int | str) -> Run:
+        """Return the run of a position, or of an id such as ``seed0003``.
+
+        Raises:
+            IndexError: if there are fewer runs.
+            KeyError: if no run has this id.
+        """
+        if isinstance(run, str):
+            ids = [each.id for each in self.runs]
+            if run not in ids:
+                raise KeyError(f"no run {run!r}; there are {ids}")
+            return self.runs[ids.index(run)]
+        return self.runs[run]
 
     def __iter__(self) -> Iterator[Run]:
         return iter(self.runs)
 
     def __repr__(self) -> str:
-        whole = f" ({printable(self.info.part)} runs of the whole)" if self.info.part else ""
-        lines = [f"<Dataset {self.info.id} ({self.info.status}), {len(self)} runs{whole}>"]
-        return "\n".join(lines + [f"  {run.split or '-':<10} {run!r}" for run in self.runs])
+        return overview.as_text(self)
+
+    def _repr_html_(self) -> str:
+        return overview.as_html(self)
 
 
 def open_dataset(
