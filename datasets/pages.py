@@ -26,8 +26,8 @@ from matplotlib.ticker import FuncFormatter
 
 import weighttraj as wt
 from weighttraj.collect import Recipe, read_recipe
-from weighttraj.collect.costs import read_costs
 from weighttraj.collect.agents import actor_parameters
+from weighttraj.collect.costs import read_costs
 from weighttraj.collect.population import Origin
 from weighttraj.publish.curves import KINDS, Kind, band, curves, mean_returns
 from weighttraj.registry.croissant import citation
