@@ -299,7 +299,9 @@ def _contents(recipe: Recipe, facts: Facts) -> Iterator[str]:
         held = sum(facts.here.runs.values())
         which = f"{held} of the recipe's {total} runs" if held < total else f"All {total} runs"
         yield f"- {which} are in this repository: {_counts(facts.here)}; {facts.here.megabytes} MB."
-    if facts.collected is not None:
+    if facts.collected is not None and (
+        facts.here is None or facts.here.runs != facts.collected.runs
+    ):
         held = sum(facts.collected.runs.values())
         yield (
             f"- {held} of the recipe's {total} runs had been collected when this page was "
