@@ -158,19 +158,18 @@ def _show(
 
 @app.command(name="list")
 def _list() -> None:
-    """List the data sets that can be named by an id here."""
+    """List the data sets that can be named by an id here. `show ID` says where one lies."""
     table = Table(title="data sets")
-    for column in ("id", "version", "status", "runs", "MB", "path"):
+    for column in ("id", "status", "runs", "MB"):
         justify: Literal["left", "right"] = "right" if column in ("runs", "MB") else "left"
         table.add_column(column, justify=justify, overflow="fold", no_wrap=column == "id")
     for dataset in registry.local_datasets():
         try:
             info = dataset.info
-            said = [info.version, info.status, str(len(info.runs))]
+            said = [info.status, info.part or str(len(info.runs))]
         except WeightTrajError as error:
-            said = ["-", f"damaged: {error.message.splitlines()[0]}", "-"]
-        row = [dataset.id, *said, f"{dataset.size / 1e6:.1f}", str(dataset.path)]
-        table.add_row(*map(escape, row))
+            said = [f"damaged: {error.message.splitlines()[0]}", "-"]
+        table.add_row(*map(escape, [dataset.id, *said, f"{dataset.size / 1e6:.1f}"]))
     console.print(table)
 
 

@@ -592,7 +592,10 @@ def test_a_data_set_is_seen_at_a_glance(small_dataset: Path) -> None:
     assert "<td style='text-align:left'>4 runs: 2 train, 2 test</td>" in dataset._repr_html_()
 
 
-def test_a_data_set_is_not_opened_as_a_run(small_dataset: Path) -> None:
+def test_one_run_opens_as_a_data_set_of_one_run(small_dataset: Path, tmp_path: Path) -> None:
+    for path in (write(tmp_path / "run.zarr").path, small_dataset / "runs/seed0000.zarr.zip"):
+        (run,) = wt.open(path)
+        assert run["digest"][:].tobytes() == wt.open_run(path)["digest"][:].tobytes()
     with pytest.raises(FileNotFoundError):
         wt.open_run(small_dataset)
 
@@ -602,7 +605,7 @@ def test_a_run_under_anothers_name_is_refused(small_dataset: Path, tmp_path: Pat
     shutil.copytree(small_dataset, path)
     shutil.copy(path / "runs/seed0000.zarr.zip", path / "runs/seed0001.zarr.zip")
     with pytest.raises(FormatError, match="not the one that the data set lists"):
-        print(wt.open(path))
+        wt.open(path)["seed0001"].weights
 
 
 def test_a_kill_between_a_rewritten_block_and_its_commit_loses_nothing(tmp_path: Path) -> None:

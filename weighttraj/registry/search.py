@@ -84,7 +84,7 @@ def _table(dataset: LocalDataset) -> pd.DataFrame:
     else:
         table = read_table(dataset.path, RUNS, len(dataset.info.runs))
     known = [c for c in table.column_names if c in RUN_COLUMNS or c.startswith(HYPERPARAMETER)]
-    frame: pd.DataFrame = table.select(known).to_pandas()
+    frame: pd.DataFrame = table.select(known).to_pandas(ignore_metadata=True)
     return frame
 
 
