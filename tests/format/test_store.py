@@ -605,7 +605,7 @@ def test_a_run_under_anothers_name_is_refused(small_dataset: Path, tmp_path: Pat
     shutil.copytree(small_dataset, path)
     shutil.copy(path / "runs/seed0000.zarr.zip", path / "runs/seed0001.zarr.zip")
     with pytest.raises(FormatError, match="not the one that the data set lists"):
-        wt.open(path)["seed0001"].weights
+        _ = wt.open(path)["seed0001"].weights
 
 
 def test_a_kill_between_a_rewritten_block_and_its_commit_loses_nothing(tmp_path: Path) -> None:
