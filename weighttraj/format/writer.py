@@ -158,10 +158,11 @@ class RunWriter:
         """Append one row of the iteration-indexed arrays: network inputs of its rollout.
 
         Args:
-            probe_observations: (probe, *obs).
+            probe_observations: inputs of the network, shape (probe, ...) with the shape of an
+                observation after the first axis.
 
         Raises:
-            SnapshotError: the shape is not ``(info.probe_observations, *observation)``.
+            SnapshotError: if the shape is another one.
         """
         self._append("iteration", {"probe/observations": probe_observations})
 
