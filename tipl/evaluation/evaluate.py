@@ -53,14 +53,11 @@ def evaluate(
             forecasters have one name.
         KeyboardInterrupt: it was stopped; what was measured stays.
     """
-    for forecaster in forecasters:
-        check_forecaster(forecaster)
-    config = config.bounded()
+    config, everyone = config.bounded(), _everyone(forecasters)
     dataset = wt.open_dataset(config.data)
     runs, left_out = _whole_runs(dataset.split(config.split).runs, config)
     _check_runs(runs, config)
     config = _within(config, min(len(run) for run in runs) // 2)
-    everyone = _everyone(forecasters)
     tasks = [Task(path=run.path.absolute(), forecasters=everyone, config=config) for run in runs]
     starts_of(runs[0], config)  # what is too short or has no returns is refused before the work
     with engine_of(workers, imports=imports) as engine:
@@ -92,8 +89,11 @@ def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
     """Return what is evaluated: persistence, the forecasters, and their oracles.
 
     Raises:
+        ForecastError: an object does not follow the protocol.
         EvaluateError: two of them have one name.
     """
+    for forecaster in forecasters:
+        check_forecaster(forecaster)
     persistence = load("persistence")
     oracles = {o.name: o for f in forecasters for o in getattr(f, "oracles", ())}
     everyone = (
