@@ -24,7 +24,7 @@ def run(
     [
         ("weighttraj", "--help"),
         ("weighttraj", "collect", "--help"),
-        ("tipl", "train", "--help"),
+        ("tipl", "train", "tipl", "--help"),
         ("tipl", "evaluate", "--help"),
     ],
 )
@@ -109,7 +109,10 @@ def test_pack_and_cache(small_dataset: Path, tmp_path: Path) -> None:
         (("weighttraj", "show", "nowhere"), "no data set or run at nowhere"),
         (("weighttraj", "collect", "nowhere.toml"), "nowhere.toml"),
         (("weighttraj", "report"), "name a data set"),
-        (("tipl", "train", "--data", "nowhere", "--out", "x"), "no data set or run at nowhere"),
+        (
+            ("tipl", "train", "tipl", "--data", "nowhere", "--out", "x"),
+            "no data set or run at nowhere",
+        ),
     ],
 )
 def test_errors_are_one_message(
@@ -125,7 +128,7 @@ def test_errors_are_one_message(
 
 
 def test_a_misspelt_option_is_answered_with_the_right_one() -> None:
-    done = run("tipl", "train", "--data", "a", "--out", "b", "--n-batchs", "3")
+    done = run("tipl", "train", "tipl", "--data", "a", "--out", "b", "--n-batchs", "3")
     assert done.returncode == 2
     assert "--n-batches" in done.stdout + done.stderr
 

@@ -182,3 +182,7 @@ def _complete(arguments: Sequence[str]) -> None:
         train.command(_trainer(kind), name=name)
     app.command(train, name="train")
     app.cli(prog="tipl", args=list(arguments), config=(tyro.conf.OmitArgPrefixes,))
+
+
+if __name__ == "__main__":
+    main()
