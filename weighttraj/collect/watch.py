@@ -11,8 +11,8 @@ from weighttraj.errors import CollectError
 class Watch:
     """Remembers the recorded parameters as the last counted step left them.
 
-    A copy is taken after every counted step; it is compared before every step of the first update,
-    and later at the borders of rollouts, so that the cost stays below a hundredth of a step's.
+    A copy is taken after every counted step. It is compared before every step of the first update
+    and later at the borders of rollouts; ``tests/benchmarks/bench_callback.py`` measures the cost.
 
     Args:
         agent: whose parameters.
