@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import glob
 import os
 import secrets
@@ -28,6 +29,7 @@ DRAFT = ".draft"
 """Ending of files and folders that are not whole yet; their names begin with a dot."""
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LINKED = (errno.ELOOP, errno.ENOTDIR, errno.EMLINK)  # what systems say of O_NOFOLLOW and a link
 
@@ -36,7 +38,8 @@ _LINKED = (errno.ELOOP, errno.ENOTDIR, errno.EMLINK)  # what systems say of O_NO
 def replacing(path: Path, *, root: Path | None = None, durable: bool = True) -> Iterator[BinaryIO]:
     """Open a new file that takes the place of ``path`` when the block ends.
 
-    Readers see the old content or the new one. If the block fails, the new file is removed.
+    Readers see the old content or the new one. If the block fails, the new file is removed; if the
+    process is killed, by the next one that writes the same path.
 
     Args:
         path: the file. Folders below ``root`` are made.
@@ -48,9 +51,10 @@ def replacing(path: Path, *, root: Path | None = None, durable: bool = True) -> 
         FormatError: a part of the path below ``root`` is a link.
     """
     with _parent_of(path, root) as folder:
-        draft = f".{path.name}.{secrets.token_hex(8)}{DRAFT}"
+        _remove_abandoned_files(path.name, folder)
+        draft, number = _locked_draft(path.name, folder)
         try:
-            with os.fdopen(os.open(draft, _NEW, 0o666, dir_fd=folder), "wb") as file:
+            with os.fdopen(number, "wb") as file:
                 yield file
                 file.flush()
                 if durable:
@@ -66,6 +70,34 @@ def replacing(path: Path, *, root: Path | None = None, durable: bool = True) -> 
             raise
         if durable:
             os.fsync(folder)
+
+
+def _locked_draft(name: str, folder: int) -> tuple[str, int]:
+    """Make a draft of a file in an opened folder; return its name and its file descriptor.
+
+    The lock on it tells others that its writer is alive.
+    """
+    while True:
+        draft = f".{name}.{secrets.token_hex(8)}{DRAFT}"
+        number = os.open(draft, _NEW, 0o666, dir_fd=folder)
+        fcntl.flock(number, fcntl.LOCK_EX)
+        if os.fstat(number).st_nlink:  # else it was removed between the two lines above
+            return draft, number
+        os.close(number)
+
+
+def _remove_abandoned_files(name: str, folder: int) -> None:
+    """Remove the drafts of a file whose writers were killed: nobody holds their locks."""
+    drafts = (f for f in os.listdir(folder) if f.startswith(f".{name}.") and f.endswith(DRAFT))
+    for draft in drafts:
+        with contextlib.suppress(OSError):  # it is locked, gone, or no file
+            number = os.open(draft, _READ, dir_fd=folder)
+            try:
+                if stat.S_ISREG(os.fstat(number).st_mode):
+                    fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    os.unlink(draft, dir_fd=folder)
+            finally:
+                os.close(number)
 
 
 def replace_file(
@@ -111,10 +143,14 @@ def remove_abandoned(target: Path) -> None:
     """Remove the folders that ``drafting`` made for a path in processes that were killed."""
     for old in target.parent.glob(f".{glob.escape(target.name)}.*{DRAFT}"):
         lock = old / "lock"
-        # A link is nobody's draft: what it leads to is not ours to lock or to remove.
-        if not old.is_symlink() and lock.is_file() and not lock.is_symlink():
+        if old.is_symlink() or lock.is_symlink():
+            continue  # a link is nobody's draft: what it leads to is not ours to lock or to remove
+        if lock.is_file():
             with contextlib.suppress(Timeout), FileLock(lock, timeout=0):
                 shutil.rmtree(old)
+        else:  # killed before it took its lock, when the folder is still empty
+            with contextlib.suppress(OSError):
+                old.rmdir()
 
 
 @contextlib.contextmanager

@@ -52,7 +52,9 @@ class _Collect:
 def _collect(args: _Collect) -> None:
     """Collect the data set of a recipe, or go on where it stopped."""
     from weighttraj.collect.recipe import parse_seeds
+    from weighttraj.plugins import import_modules
 
+    import_modules(args.imports)  # the recipe may name an environment of theirs
     recipe = wt.collect.read_recipe(here(args.recipe))
     out = args.out or Path(COLLECTED) / recipe.id
     seeds = None if args.seeds is None else parse_seeds(args.seeds)

@@ -27,8 +27,14 @@ def printable(text: object, *, lines: bool = False) -> str:
 
 
 def shortened(text: str, limit: int) -> str:
-    """Cut a text that is too long, and say how long it was."""
-    return text if len(text) <= limit else f"{text[:limit]}... ({len(text):,} characters)"
+    """Cut the middle out of a text that is too long, and say how long it was.
+
+    The end stays: an error that came through another process has its reason there.
+    """
+    if len(text) <= limit:
+        return text
+    half = limit // 2
+    return f"{text[:half]}... ({len(text):,} characters) ...{text[-half:]}"
 
 
 def markdown(text: object) -> str:

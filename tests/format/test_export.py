@@ -175,7 +175,8 @@ def test_a_draft_appears_whole_or_not_at_all(tmp_path: Path) -> None:
         assert not path.exists()
         left = draft
     assert (path / "whole").read_text() == "whole"
-    left.mkdir()  # as a killed process of the same number would have left it
+    left.mkdir(parents=True)  # as a killed process would have left it
+    (left.parent / "lock").touch()
     (left / "half").write_text("half")
     (path / "whole").unlink()
     path.rmdir()

@@ -186,7 +186,7 @@ def test_a_policy_of_four_million_parameters_is_recorded_and_read(tmp_path: Path
         model.learn(4, callback=callback)
     run = wt.open_run(tmp_path / "run.zarr")
     assert (len(run), run.layout.size, run.info.block) == (2, 4_422_602, 15)
-    actor = np.concatenate([p.detach().numpy().ravel() for p in callback._actor.values()])
+    actor = np.concatenate([p.detach().numpy().ravel() for p in callback._agent.actor.values()])
     assert np.array_equal(run.weights[-1], actor)
 
 

@@ -43,7 +43,7 @@ def test_commands_take_an_id(
         monkeypatch.setattr("sys.argv", ["weighttraj", command, "small"])
         main()
     said = capsys.readouterr().out
-    assert "<Dataset small (complete), 4 runs>" in said
+    assert "<Dataset small, version 1, complete>" in said
     assert "small: whole" in said
 
 

@@ -613,7 +613,8 @@ def child(folder, n):
         change = event in ("os.rename", "shutil.rmtree")
         write = os.O_WRONLY | os.O_RDWR | os.O_CREAT
         change |= event == "open" and isinstance(arguments[2], int) and bool(arguments[2] & write)
-        if change and str(folder) in str(arguments[0]):
+        # Files are opened and renamed in their opened folder, by their names alone.
+        if change and (str(folder) in str(arguments[0]) or str(arguments[0]).endswith(".draft")):
             count += 1
             if count == n:
                 os.kill(os.getpid(), signal.SIGKILL)

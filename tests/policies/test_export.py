@@ -34,7 +34,7 @@ class Told:
 
     def __init__(self, run: wt.Run, info: wt.RunInfo) -> None:
         self.path, self.info, self.specs = run.path, info, run._store.specs
-        self.read = run._store.read
+        self.read, self.chunk_rows = run._store.read, run._store.chunk_rows
 
 
 def told(run: wt.Run, **changes: object) -> wt.Run:

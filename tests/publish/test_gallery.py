@@ -242,7 +242,7 @@ def test_the_command(
     cli._report(cli._Report(all=True, film=False, out=out, cards=place / "cards"))
     assert capsys.readouterr().out.endswith("index.html\n")
     assert (out / "data/small.html").is_file()
-    assert (out / "cards/a-model.html").is_file()
+    assert (out / "models/a-model.html").is_file()
     with pytest.raises(SystemExit):
         cli._report(cli._Report())
     assert "--all" in capsys.readouterr().err

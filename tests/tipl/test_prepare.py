@@ -51,7 +51,7 @@ def test_each_run_has_its_own_basis(tmp_path: Path) -> None:
 
 
 def test_a_data_set_without_the_split_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"has no runs(.|\n)*'train'; there are \['test'\]"):
+    with pytest.raises(FormatError, match=r"one of \['test'\](.|\n)*'train'"):
         prepare(dataset(tmp_path, ("test", walk(30), 64)), rank=3, window=5)
 
 

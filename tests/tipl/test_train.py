@@ -202,7 +202,7 @@ def test_a_data_set_without_training_runs_is_refused(config: TrainConfig, tmp_pa
     (tmp_path / "dataset").mkdir()
     info = replace(read_dataset_info(config.data), runs=(), status="collecting")
     write_dataset_info(tmp_path / "dataset", info)
-    with pytest.raises(FormatError, match="no runs"):
+    with pytest.raises(FormatError, match="holds no run of this split"):
         train(change(config, data=tmp_path / "dataset"))
 
 

@@ -162,7 +162,7 @@ def _environment_problems(config: PPOConfig, population: bool) -> Iterator[Probl
     except Exception as error:  # also from the code of the environment's author
         expected = (
             "an id in gymnasium's registry, such as InvertedPendulum-v4, of an environment that "
-            "can be made (import the package that registers yours)"
+            "can be made (--import MODULE imports one that registers yours)"
         )
         yield _problem("ppo.env_id", expected, f"{config.env_id!r}: {error.__cause__ or error}")
         return

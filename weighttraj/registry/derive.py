@@ -26,6 +26,7 @@ from weighttraj.format import (
     seal,
 )
 from weighttraj.format.catalog import write_dataset_info
+from weighttraj.format.locate import locate
 from weighttraj.format.packing import copy_packed
 from weighttraj.format.storage import PACKED
 from weighttraj.progress import LoggedProgress
@@ -156,7 +157,7 @@ def select(
         RegistryError: if a seed has no run, or its run is not complete.
         StoreExistsError: if the folder exists.
     """
-    dataset = open_dataset(path)
+    dataset = open_dataset(locate(path))
     known = {run.info.seed: run for run in dataset if run.info.status == "complete"}
     missing = [seed for seed in seeds if seed not in known]
     if missing or not seeds:
@@ -219,7 +220,7 @@ def split(
 
 
 def _complete(path: str | Path) -> Dataset:
-    dataset = open_dataset(path)
+    dataset = open_dataset(locate(path))
     hdf5 = Path(dataset.path).suffix == ".h5"
     if dataset.info.status != "complete" or hdf5:
         raise RegistryError(
