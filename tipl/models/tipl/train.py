@@ -82,7 +82,7 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
     Under `torchrun` each process takes its share of every batch. The training is the same but for
     rounding and dropout, which each process draws for its own windows::
 
-        torchrun --nproc-per-node 2 -m tipl train tipl --data DATA --out OUT
+        torchrun --standalone --nproc-per-node 2 -m tipl train tipl --data DATA --out OUT
 
     Each line of the log has the mean training WPE since the line before, with dropout; and, where
     the data set has a validation split, the WPE one step ahead on its runs, without dropout. By
