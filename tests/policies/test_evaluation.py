@@ -237,7 +237,7 @@ def test_an_interrupt_ends_it_at_the_next_step(kind: str, full_run: Any, tmp_pat
         process.send_signal(signal.SIGINT)
         lines = process.stdout.read().splitlines()  # to the end of the process
         assert process.wait(timeout=60) == 0
-    assert lines[-1] == "stopped"
+    assert lines[-1].endswith("stopped")  # the signal may come between a word and its line's end
 
 
 def test_an_old_run_that_has_text_for_a_number_is_refused(full_run: Any) -> None:

@@ -8,6 +8,7 @@ each process takes its share of every batch.
 from __future__ import annotations
 
 import contextlib
+import gc
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -135,6 +136,10 @@ def train_network(
         ranks.from_first(lambda: keep_settings(out, told, config.may_differ, defaults))
         loop.run()
         ranks.from_first(lambda: None)  # the model is there when any process returns
+        # The gradients' reducer holds the group of processes. If it outlives the group's end, torch
+        # waits in its destructor for a thread that waits for Python: the process never ends.
+        del learner, loop
+        gc.collect()
 
 
 class _Loop(Generic[E]):
