@@ -217,7 +217,8 @@ def _made_by(runs: Sequence[wt.Run]) -> str:
     cpus = sorted({p.cpu for p in provenances})
     versions = {tuple(sorted(p.packages.items())) for p in provenances}
     told = ("; or ").join(", ".join(" ".join(pair) for pair in each) for each in sorted(versions))
-    return f"{algorithm.library if algorithm else ''} on {' and '.join(cpus)}, with {told}"
+    trainer = getattr(algorithm, "library", "")
+    return f"{trainer} on {' and '.join(cpus)}, with {told}"
 
 
 def _final(runs: Sequence[wt.Run], kind: Kind) -> Interval | None:
