@@ -18,9 +18,9 @@ from weighttraj import registry
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
 from weighttraj.errors import WeightTrajError
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.load.cache import CachedWeights
 from weighttraj.policies import ReturnsConfig, fill_returns
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 FEW = ReturnsConfig(episodes=1, every=1000, modes=("deterministic",))
 RECIPE = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1]))

@@ -19,7 +19,7 @@ import weighttraj as wt
 from tests.benchmarks.stress_format import live_copy
 from weighttraj.cli import main
 from weighttraj.errors import FormatError, RemoteError
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 from weighttraj.terminal import Output, say
 from weighttraj.text import markdown, printable, yaml
 

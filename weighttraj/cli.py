@@ -16,11 +16,11 @@ from rich.table import Table
 import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import RegistryError, WeightTrajError
-from weighttraj.format.lint import lint_returns
-from weighttraj.format.locate import COLLECTED, clone, locate
+from weighttraj.locate import COLLECTED, clone, locate
 from weighttraj.plugins import import_modules
 from weighttraj.remote import RemotePath, here, is_remote
 from weighttraj.terminal import Output, say, while_read
+from weighttraj.tools.lint import lint_returns
 
 Imports = Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")]
 """Modules that register environments, of the option --import."""

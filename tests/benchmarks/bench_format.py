@@ -30,8 +30,8 @@ from results import save
 
 import weighttraj as wt
 from weighttraj.format import DatasetInfo, RunEntry
-from weighttraj.format.catalog import write_dataset_info
-from weighttraj.format.live import LiveStore
+from weighttraj.store.catalog import write_dataset_info
+from weighttraj.store.live import LiveStore
 
 Reader = Callable[[], np.ndarray]
 

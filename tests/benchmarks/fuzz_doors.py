@@ -40,11 +40,11 @@ from tests.benchmarks.stress_format import (
 from weighttraj import registry
 from weighttraj.collect import read_recipe
 from weighttraj.collect.recipe import Recipe
-from weighttraj.format.catalog import write_manifest
-from weighttraj.format.hdf5 import export_hdf5, import_hdf5
 from weighttraj.publish.source import facts, lead, open_source, run_rows, settings
 from weighttraj.registry.download import source_of
 from weighttraj.registry.local import LocalDataset
+from weighttraj.store.catalog import write_manifest
+from weighttraj.tools.hdf5 import export_hdf5, import_hdf5
 
 STRANGE = [
     None, True, False, 0, 1, -1, 0.5, -0.0, 1e308, 2**31, 2**53 + 1, 2**62, 2**63, 2**64, 10**30,

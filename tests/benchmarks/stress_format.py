@@ -5,7 +5,7 @@ nice python -W ignore tests/benchmarks/stress_format.py --kills 200 --flips 1000
 
 Prints one JSON line of counts, and exits with 1 if a promise was broken. Each case follows from
 the seed, its part and its number: `--only flips --first 4711 --flips 1` does one of them again.
-The small versions in tests/format/test_faults.py call the same functions.
+The small versions in tests/store/test_faults.py call the same functions.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ from weighttraj.atomic import DRAFT
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
 from weighttraj.errors import WeightTrajError
-from weighttraj.format import ParamLayout, RunInfo, RunWriter
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
-from weighttraj.format.live import LiveStore
-from weighttraj.format.storage import checksum
+from weighttraj.format import ParamLayout, RunInfo
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.live import LiveStore
+from weighttraj.store.zarr_run import checksum
+from weighttraj.writer import RunWriter
 
 ALLOWED = (WeightTrajError, FileNotFoundError)
 """What reading and verifying may raise."""

@@ -17,7 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import weighttraj as wt
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.errors import CollectError
-from weighttraj.format import Continuation, lint
+from weighttraj.format import Continuation
+from weighttraj.tools.lint import lint
 
 pytestmark = pytest.mark.filterwarnings("ignore:the weights of this training are recorded")
 

@@ -27,8 +27,8 @@ from weighttraj.collect import Recipe, collect, read_recipe, replay
 from weighttraj.collect.recipe import Collect, Seeds
 from weighttraj.errors import CollectError, RecipeError
 from weighttraj.format import DatasetInfo, RunEntry
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
-from weighttraj.format.integrity import seal
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
+from weighttraj.tools.repair import seal
 
 QUICK = replace(SMALL_RECIPE, seeds=Seeds(train=[0, 1]), collect=Collect(collector="population"))
 

@@ -12,7 +12,7 @@ import torch
 import weighttraj as wt
 from weighttraj.collect import replay
 from weighttraj.errors import CollectError
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 
 @pytest.mark.parametrize(("n", "seed"), [(1, None), (6, 2), (49, 1), (1000, 0)])

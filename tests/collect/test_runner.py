@@ -28,7 +28,7 @@ from weighttraj.collect.recipe import Seeds, Store, parse_seeds
 from weighttraj.collect.tasks import Task, collect_block
 from weighttraj.errors import CollectError, EngineError, RecipeError
 from weighttraj.format import RunEntry
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 TOML = """
 id = "small"

@@ -9,10 +9,10 @@ from pathlib import Path
 import weighttraj.format
 from tests.golden.make import INFO
 from weighttraj.format import FORMAT_VERSION, DatasetInfo, Evaluation, RunEntry, RunInfo
-from weighttraj.format.catalog import DATASET, MANIFEST
-from weighttraj.format.codecs import KNOWN_CODECS, MAX_CHUNK_PARAMS, MAX_NARROW
 from weighttraj.format.schema import arrays_of
-from weighttraj.format.tables import RUNS, SNAPSHOTS
+from weighttraj.store.catalog import DATASET, MANIFEST
+from weighttraj.store.codecs import KNOWN_CODECS, MAX_CHUNK_PARAMS, MAX_NARROW
+from weighttraj.tools.tables import RUNS, SNAPSHOTS
 
 SPEC = Path(weighttraj.format.__file__).with_name("FORMAT.md").read_text()
 

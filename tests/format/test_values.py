@@ -12,7 +12,8 @@ import torch
 
 import weighttraj as wt
 from weighttraj.errors import SnapshotError
-from weighttraj.format import ObsNorm, ParamLayout, RunInfo, RunWriter
+from weighttraj.format import ObsNorm, ParamLayout, RunInfo
+from weighttraj.writer import RunWriter
 
 LAYOUT = ParamLayout.of({"w": ((2, 2), "weight", ("fixed", "fixed"))})
 VALUES = np.array([0.5, -1.25, 3.0, 2.0**-10], np.float32)  # bfloat16 and float16 hold them exactly

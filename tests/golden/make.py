@@ -26,9 +26,9 @@ from weighttraj.format import (
     Provenance,
     RunEntry,
     RunInfo,
-    RunWriter,
 )
-from weighttraj.format.catalog import write_dataset_info
+from weighttraj.store.catalog import write_dataset_info
+from weighttraj.writer import RunWriter
 
 ROWS = 20
 SMALL = ParamLayout.of(

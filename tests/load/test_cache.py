@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import weighttraj as wt
+from weighttraj import run as reader
 from weighttraj.errors import DamageError
-from weighttraj.format import reader
-from weighttraj.format.packing import pack
 from weighttraj.load import CachedWeights, CacheError, cache_folder, cache_size, clear_cache
+from weighttraj.tools.pack import pack
 
 ROOT = Path(__file__).parents[2]
 HEADER = 128
@@ -233,7 +233,7 @@ def test_a_folder_that_cannot_be_made_is_an_error_that_names_the_variable(
 LIMITED = """
 import resource, sys
 import weighttraj as wt
-from weighttraj.format.packing import pack
+from weighttraj.tools.pack import pack
 from weighttraj.load import CachedWeights, CacheError
 if sys.argv[2:]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000_000, 10_000_000))

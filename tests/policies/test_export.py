@@ -18,8 +18,8 @@ import weighttraj as wt
 from tests.small import CONFIGS, learn
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.errors import PolicyError, StoreExistsError
-from weighttraj.format.reader import Run
 from weighttraj.policies import export_sb3
+from weighttraj.run import Run
 
 
 @pytest.fixture(scope="module", params=list(CONFIGS))

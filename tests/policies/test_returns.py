@@ -24,12 +24,12 @@ from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.engine import Tell
 from weighttraj.errors import EngineError, FormatError, PolicyError, StoreLockedError
 from weighttraj.format import RunEntry
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
-from weighttraj.format.lint import lint_returns
 from weighttraj.learning import learning_phase
 from weighttraj.policies import EpisodeReturns, ReturnsConfig, evaluate, fill_returns, returns
 from weighttraj.policies.returns import play_rows
 from weighttraj.registry import create
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
+from weighttraj.tools.lint import lint_returns
 
 CONFIG = ReturnsConfig(episodes=2, every=20, first=3)
 ROWS = [0, 1, 2, 20, 40, 48]

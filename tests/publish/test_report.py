@@ -216,7 +216,7 @@ def test_only_reports_are_overwritten(tmp_path: Path) -> None:
 
 def test_a_data_set_without_runs_has_no_report(small_dataset: Path, tmp_path: Path) -> None:
     data = shutil.copytree(small_dataset, tmp_path / "data")
-    from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+    from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
     write_dataset_info(data, replace(read_dataset_info(data), status="collecting"))
     shutil.rmtree(data / "runs")

@@ -23,10 +23,10 @@ from weighttraj.errors import (
     StoreExistsError,
     WeightTrajError,
 )
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
-from weighttraj.format.locate import VARIABLE, clone, locate
+from weighttraj.locate import VARIABLE, clone, locate
 from weighttraj.registry import combine, create, delete, local_datasets, search, select, split
 from weighttraj.registry.derive import SPLITS, _parts
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote import servers
 from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo
-from weighttraj.format.catalog import write_dataset_info
 from weighttraj.registry import create
 from weighttraj.remote.store import store_at
+from weighttraj.store.catalog import write_dataset_info
 
 CARD = "# A small data set\n\n## Citation\n\nNone.\n"
 CREDENTIALS = {"aws_access_key_id": "key", "aws_secret_access_key": "secret"}

@@ -17,7 +17,7 @@ from tests.remote import servers
 from tests.remote.conftest import Bucket, files_of, objects_of
 from tests.test_cli import run as shell
 from weighttraj.errors import RegistryError
-from weighttraj.format.locate import locate
+from weighttraj.locate import locate
 from weighttraj.registry.download import source_of
 from weighttraj.remote import RemotePath, is_remote
 from weighttraj.remote.address import below, new_path

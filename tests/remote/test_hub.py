@@ -18,9 +18,9 @@ from tests.remote.conftest import files_of
 from tipl.models.gate import Gate
 from weighttraj.errors import RegistryError, RemoteError
 from weighttraj.format import DatasetInfo
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.remote import RemotePath
 from weighttraj.remote.store import store_at
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 GATE = "tipl-gate-inverted-pendulum-v4"
 

@@ -29,12 +29,13 @@ from weighttraj.errors import (
     StoreExistsError,
     StoreLockedError,
 )
-from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo, RunWriter
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.format import DatasetInfo, ParamLayout, RunEntry, RunInfo
 from weighttraj.registry.download import source_of
 from weighttraj.registry.upload import CLAIM
 from weighttraj.remote import RemotePath
 from weighttraj.remote.store import RemoteStore, store_at
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
+from weighttraj.writer import RunWriter
 
 
 def store_of(address: str) -> RemoteStore:
@@ -194,7 +195,7 @@ def test_what_looks_suspicious_is_held_back(published: Path, tmp_path: Path) -> 
     twins = tmp_path / "twins"
     wt.registry.create([published / "runs/seed0000.zarr.zip"], tmp_path / "one")
     renamed = tmp_path / "twin.zarr.zip"
-    from weighttraj.format.packing import copy_packed
+    from weighttraj.tools.pack import copy_packed
 
     copy_packed(published / "runs/seed0000.zarr.zip", renamed, "twin")
     wt.registry.create([published / "runs/seed0000.zarr.zip", renamed], twins)

@@ -44,9 +44,9 @@ from tipl.saved import fingerprint
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
 from weighttraj.format import DatasetInfo, RunEntry
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import ReturnsConfig, fill_returns
 from weighttraj.policies import evaluate as play
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 ROOT = Path(__file__).parents[2]
 SMALL = {

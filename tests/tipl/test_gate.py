@@ -41,7 +41,7 @@ from tipl.training import loop
 from tipl.training.checkpoint import read_log
 from weighttraj.collect import collect
 from weighttraj.collect.recipe import Seeds
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 
 @pytest.fixture(scope="module")

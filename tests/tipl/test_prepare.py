@@ -9,10 +9,10 @@ import pytest
 import weighttraj as wt
 from tipl.errors import TrainError
 from tipl.models.tipl.data import prepare
+from weighttraj import writer
 from weighttraj.errors import FormatError
-from weighttraj.format import writer
-from weighttraj.format.catalog import write_dataset_info
 from weighttraj.format.schema import Cadence, DatasetInfo, RunEntry
+from weighttraj.store.catalog import write_dataset_info
 
 
 def walk(n: int, size: int = 6, seed: int = 0) -> np.ndarray:

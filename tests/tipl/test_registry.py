@@ -20,9 +20,9 @@ from tipl.errors import ForecastError, LeftOutWarning, TrainError
 from tipl.evaluation.results import read_results
 from tipl.models.baselines.train import BaselinesConfig, train_baselines
 from tipl.models.gate import GateTrainConfig, train_gate
-from weighttraj.format import writer
-from weighttraj.format.catalog import write_dataset_info
+from weighttraj import writer
 from weighttraj.format.schema import Cadence, DatasetInfo, RunEntry
+from weighttraj.store.catalog import write_dataset_info
 
 OWN = '''
 import numpy as np

@@ -18,8 +18,8 @@ from tipl.evaluation.starts import learning_phase
 from tipl.models.scaled import Scaled, ScaledGate, ScaledTrainConfig, train_scaled
 from tipl.models.scaled.train import gains_of
 from tipl.registry import load
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
 from weighttraj.policies import load_policies
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 AMPLITUDES = {1: 4.0, 2: 2.0, 5: 1.5}
 

@@ -17,7 +17,7 @@ import weighttraj as wt
 from tipl import TIPL, Persistence, Reconstruction, TemporalSVD, TrainConfig, change, train
 from tipl.errors import ForecastError, ModelError, TrainError
 from weighttraj.errors import FormatError
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 
 @pytest.fixture

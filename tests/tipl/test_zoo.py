@@ -42,7 +42,7 @@ from tipl.zoo.card import facts, metrics_of, refreshed, write_card
 from tipl.zoo.listing import listed
 from tipl.zoo.metrics import read_metrics
 from tipl.zoo.release import LINES, MOST, release, thinned
-from weighttraj.format.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 ROOT = Path(__file__).parents[2]
 

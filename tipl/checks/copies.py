@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int
 from tipl.runs import weights_of
 from weighttraj import ParamLayout, Run, RunWriter, open_run
 from weighttraj.format import DatasetInfo, RunEntry
-from weighttraj.format.catalog import write_dataset_info
+from weighttraj.store.catalog import write_dataset_info
 
 Moments = tuple[Float32[np.ndarray, "time param"], Float32[np.ndarray, "time param"]]
 """First and second moments of Adam."""

@@ -14,9 +14,9 @@ from tipl import registry
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster
 from tipl.zoo.card import write_card
-from weighttraj.format.catalog import write_manifest
 from weighttraj.registry.upload import repository_of, upload_folder
 from weighttraj.remote import RemotePath, hub
+from weighttraj.store.catalog import write_manifest
 
 
 def push(

@@ -22,8 +22,10 @@ from weighttraj.collect.origin import find_origin, find_source
 from weighttraj.collect.recorder import Counters, Reading, Recorder
 from weighttraj.collect.watch import Watch
 from weighttraj.errors import CollectError, PolicyError
-from weighttraj.format import Run, RunInfo, RunWriter
+from weighttraj.format import RunInfo
 from weighttraj.format.schema import Status
+from weighttraj.run import Run
+from weighttraj.writer import RunWriter
 
 _WATCHED_STEPS = 64
 """First gradient steps before which the weights of off-policy algorithms are compared; those of

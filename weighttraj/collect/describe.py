@@ -25,14 +25,7 @@ from weighttraj.collect.agents import Agent, actor_parameters
 from weighttraj.collect.environment import describe_env
 from weighttraj.collect.normalizers import Normalizers
 from weighttraj.collect.proof import find_difference
-from weighttraj.format import (
-    Algorithm,
-    Cadence,
-    ParamLayout,
-    PolicySpec,
-    Provenance,
-    RunInfo,
-)
+from weighttraj.format import Algorithm, Cadence, ParamLayout, PolicySpec, Provenance, RunInfo
 from weighttraj.format.layout import Role
 
 Acting = Literal["squashed_gaussian", "squashed", "greedy"]

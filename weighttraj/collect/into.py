@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.proof import acts_with
 from weighttraj.errors import PolicyError
-from weighttraj.format import Run
-from weighttraj.format.reader import NormStats
+from weighttraj.run import NormStats, Run
 
 Target = BaseAlgorithm | nn.Module | Mapping[str, Tensor]
 """What a snapshot is loaded into: a Stable-Baselines3 model, any module, or named tensors."""

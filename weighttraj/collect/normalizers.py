@@ -25,7 +25,7 @@ from weighttraj.collect.transparent import is_transparent, is_transparent_vec
 from weighttraj.collect.wrappers import ClipObservation, TruncationAsTermination
 from weighttraj.errors import CollectError
 from weighttraj.format.schema import ObsNorm
-from weighttraj.format.writer import Moments
+from weighttraj.writer import Moments
 
 # Wrappers that leave observations alone and do not change what an action means: SB3 clips
 # actions to the space's bounds anyway. Their subclasses are tried like any other wrapper.

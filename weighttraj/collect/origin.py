@@ -11,7 +11,9 @@ from weighttraj.collect.agents import Agent
 from weighttraj.collect.normalizers import Normalizers
 from weighttraj.collect.recorder import Counters
 from weighttraj.errors import CollectError
-from weighttraj.format import Continuation, ParamLayout, Run, open_run
+from weighttraj.format import Continuation, ParamLayout
+from weighttraj.opening import open_run
+from weighttraj.run import Run
 
 
 def find_origin(agent: Agent) -> Continuation | None:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from weighttraj.format import RunInfo, RunWriter
+from weighttraj.format import RunInfo
 from weighttraj.format.schema import Status
-from weighttraj.format.writer import check_finite
+from weighttraj.writer import RunWriter, check_finite
 
 Reading = Mapping[str, Any]
 """What an agent is at this moment: ``weights``, ``num_timesteps``, ``learning_rate``, and

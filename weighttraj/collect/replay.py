@@ -20,8 +20,9 @@ from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.recipe import Recipe, Store, parse_seeds
 from weighttraj.collect.tasks import open_recorder
 from weighttraj.errors import CollectError, WeightTrajError
-from weighttraj.format import Run, open_dataset, open_run
-from weighttraj.format.writer import explain_difference
+from weighttraj.opening import open_dataset, open_run
+from weighttraj.run import Run
+from weighttraj.writer import explain_difference
 
 
 def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:

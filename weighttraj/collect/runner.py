@@ -18,15 +18,17 @@ from weighttraj.atomic import lock_of, refuse_link
 from weighttraj.collect.costs import measured
 from weighttraj.collect.recipe import Recipe, parse_seeds
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
+from weighttraj.dataset import Dataset
 from weighttraj.engine import Engine, engine_of
 from weighttraj.errors import CollectError, RecipeError, ReplayError, WeightTrajError
-from weighttraj.format import Dataset, DatasetInfo, RunEntry, RunInfo, open_dataset
-from weighttraj.format.catalog import MANIFEST, read_dataset_info, write_dataset_info
-from weighttraj.format.integrity import seal
-from weighttraj.format.storage import PACKED, read_info
+from weighttraj.format import DatasetInfo, RunEntry, RunInfo
+from weighttraj.opening import open_dataset
 from weighttraj.plugins import import_modules
 from weighttraj.progress import LoggedProgress
 from weighttraj.remote.address import new_path
+from weighttraj.store.catalog import MANIFEST, read_dataset_info, write_dataset_info
+from weighttraj.store.zarr_run import PACKED, read_info
+from weighttraj.tools.repair import seal
 
 
 def collect(

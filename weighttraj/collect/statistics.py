@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from gymnasium.wrappers.utils import update_mean_var_count_from_moments
 
-from weighttraj.format.writer import Moments
+from weighttraj.writer import Moments
 
 _BOUND = 10.0
 """Normalised observations and scaled rewards are clipped to ``[-_BOUND, _BOUND]``."""

@@ -24,9 +24,9 @@ from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.recipe import Recipe, Store
 from weighttraj.collect.recorder import Recorder
 from weighttraj.errors import CollectError
-from weighttraj.format.packing import pack
-from weighttraj.format.storage import read_info
+from weighttraj.store.zarr_run import read_info
 from weighttraj.threads import one_torch_thread
+from weighttraj.tools.pack import pack
 
 Report = Callable[[int, int], None]
 """Called with a seed and its environment steps so far."""

@@ -22,7 +22,7 @@ from jaxtyping import Float32
 
 from weighttraj.atomic import DRAFT, replacing
 from weighttraj.errors import CacheError, WeightTrajError
-from weighttraj.format import Run
+from weighttraj.run import Run
 
 VARIABLE = "WEIGHTTRAJ_CACHE"
 """Environment variable that names the cache's folder."""

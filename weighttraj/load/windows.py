@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from weighttraj.errors import WindowError
-from weighttraj.format import Run
 from weighttraj.load.cache import CachedWeights
 from weighttraj.remote.address import RemotePath
+from weighttraj.run import Run
 
 MAX_MAPS = 200
 """Runs that one data set keeps mapped: each takes a file handle, and processes may have 1024."""

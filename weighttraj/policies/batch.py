@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Categorical, Normal
 
 from weighttraj.errors import PolicyError
-from weighttraj.format import ParamLayout, PolicySpec, Run
+from weighttraj.format import ParamLayout, PolicySpec
 from weighttraj.format.schema import ObsNorm
 from weighttraj.policies.policy import (
     ACTIVATIONS,
@@ -23,6 +23,7 @@ from weighttraj.policies.policy import (
     normalize,
     to_actions,
 )
+from weighttraj.run import Run
 
 
 class PolicyBatch:

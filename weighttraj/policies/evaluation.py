@@ -13,11 +13,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from weighttraj import environments
 from weighttraj.errors import PolicyError
-from weighttraj.format import EnvInfo, Run
+from weighttraj.format import EnvInfo
 from weighttraj.policies.batch import PolicyBatch
 from weighttraj.policies.ending import End, check_numbers, end_of
 from weighttraj.policies.policy import Policy
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
+from weighttraj.run import Run
 
 Env = gym.Env[Any, Any]
 Act = Callable[[Any, Any, bool], tuple[Any, Any]]

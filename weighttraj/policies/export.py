@@ -19,10 +19,9 @@ from torch import nn
 from weighttraj import environments
 from weighttraj.atomic import appearing
 from weighttraj.errors import CollectError, PolicyError
-from weighttraj.format import Run
-from weighttraj.format.reader import NormStats
 from weighttraj.policies.policy import load_policy
 from weighttraj.policies.rollout import env_of
+from weighttraj.run import NormStats, Run
 
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "leaky_relu": nn.LeakyReLU}
 _SHARED = (

@@ -13,10 +13,10 @@ from torch.distributions import Categorical, Normal
 from torch.nn import functional
 
 from weighttraj.errors import PolicyError
-from weighttraj.format import ParamLayout, PolicySpec, Run
+from weighttraj.format import ParamLayout, PolicySpec
 from weighttraj.format.fit import find_misfit
-from weighttraj.format.reader import NormStats
 from weighttraj.format.schema import ObsNorm
+from weighttraj.run import NormStats, Run
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "": torch.nn.Identity(),

@@ -31,20 +31,24 @@ from rich.progress import (
 )
 
 from weighttraj.atomic import appending, lock_of, refuse_link, replace_file
+from weighttraj.dataset import Dataset
 from weighttraj.engine import Engine, Tell, engine_of
 from weighttraj.errors import PolicyError, StoreLockedError
-from weighttraj.format import Dataset, Evaluation, Run, open_dataset, open_run, store_returns
-from weighttraj.format.catalog import DATASET, MANIFEST, read_dataset_info
-from weighttraj.format.integrity import seal, unseal
-from weighttraj.format.objects import MAX_DOCUMENT_BYTES
-from weighttraj.format.storage import PACKED
+from weighttraj.format import Evaluation
 from weighttraj.learning import learning_phase
+from weighttraj.opening import open_dataset, open_run
 from weighttraj.policies.batch import load_policies
 from weighttraj.policies.rollout import EpisodeReturns, Evaluator, env_of
 from weighttraj.policies.simulators import GymnasiumSimulator
 from weighttraj.progress import LoggedProgress
 from weighttraj.remote.address import here
+from weighttraj.run import Run
+from weighttraj.store.catalog import DATASET, MANIFEST, read_dataset_info
+from weighttraj.store.objects import MAX_DOCUMENT_BYTES
+from weighttraj.store.zarr_run import PACKED
 from weighttraj.text import printable
+from weighttraj.tools.repair import seal, unseal
+from weighttraj.tools.returns import store_returns
 
 Mode = Literal["deterministic", "sampled"]
 

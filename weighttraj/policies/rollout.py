@@ -14,11 +14,12 @@ import numpy as np
 
 from weighttraj import environments
 from weighttraj.errors import PolicyError
-from weighttraj.format import EnvInfo, PolicySpec, Run
+from weighttraj.format import EnvInfo, PolicySpec
 from weighttraj.policies.batch import PolicyBatch
 from weighttraj.policies.ending import check_numbers, end_of
 from weighttraj.policies.policy import Policy
 from weighttraj.policies.simulators import Simulator, make_simulator
+from weighttraj.run import Run
 from weighttraj.threads import in_threads, one_torch_thread
 
 _BLOCK = 256

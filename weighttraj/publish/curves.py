@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from weighttraj.format import Run
+from weighttraj.run import Run
 
 MAX_POINTS = 200
 """Points of a curve that is drawn."""

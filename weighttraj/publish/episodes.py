@@ -12,10 +12,10 @@ from jaxtyping import Float64, Int64
 
 from weighttraj import environments
 from weighttraj.errors import PolicyError
-from weighttraj.format import Run
 from weighttraj.policies import Evaluator, Policy, env_of, load_policies
 from weighttraj.publish.curves import Curve, mean_returns, thin
 from weighttraj.publish.scene import Placement, Pose, View, placement_of, pose_of, view_of
+from weighttraj.run import Run
 from weighttraj.threads import one_torch_thread
 
 SHARES = (0.25, 0.5, 0.75, 1.0)

@@ -13,12 +13,12 @@ import matplotlib as mpl
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from weighttraj.format import Run
 from weighttraj.publish.curves import Curve
 from weighttraj.publish.episodes import Episode, Moments, Stage, choose
 from weighttraj.publish.scene import PANEL, SCALE, Pose, camera_for, draw
 from weighttraj.publish.source import number
 from weighttraj.publish.svg import short
+from weighttraj.run import Run
 
 SECONDS = 6.0
 """Length of the film."""

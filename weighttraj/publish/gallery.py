@@ -23,12 +23,12 @@ from rich.console import Console
 
 from weighttraj.atomic import replace_file
 from weighttraj.errors import FormatError, WeightTrajError
-from weighttraj.format.objects import MAX_NAME, read_plain
 from weighttraj.publish import figures
 from weighttraj.publish.curves import KINDS, curves
 from weighttraj.publish.report import MARK, refuse_foreign, report, shown
 from weighttraj.publish.source import Source, facts, lead, open_source
 from weighttraj.publish.svg import Picture
+from weighttraj.store.objects import MAX_NAME, read_plain
 
 CARD = "README.md"
 INDEX = "index.html"

@@ -14,7 +14,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from weighttraj.atomic import refuse_existing, replace_file
 from weighttraj.errors import StoreExistsError, WeightTrajError, missing_extra
-from weighttraj.format import Run
 from weighttraj.progress import LoggedProgress
 from weighttraj.publish import figures
 from weighttraj.publish.curves import (
@@ -37,6 +36,7 @@ from weighttraj.publish.source import (
 )
 from weighttraj.publish.svg import Picture, power
 from weighttraj.publish.walk import Walk, rank_for, walk
+from weighttraj.run import Run
 from weighttraj.text import printable
 
 MARK = '<meta name="generator" content="weighttraj report">'

@@ -9,10 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from weighttraj.errors import FormatError
-from weighttraj.format import Algorithm, Run, open_dataset, open_run
+from weighttraj.format import Algorithm
 from weighttraj.format.schema import DatasetInfo
+from weighttraj.opening import open_dataset, open_run
 from weighttraj.publish.curves import final_return
 from weighttraj.remote.address import here
+from weighttraj.run import Run
 
 MINUS, DASH = "\u2212", "\u2013"
 

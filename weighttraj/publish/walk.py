@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from weighttraj.format import Run
 from weighttraj.publish.curves import thin
+from weighttraj.run import Run
 
 MAX_ROWS = 400
 """Snapshots of the Gram matrix, at most."""

@@ -18,14 +18,16 @@ from typing import Any
 import numpy as np
 
 from weighttraj.atomic import replace_file
+from weighttraj.dataset import Dataset
 from weighttraj.errors import RegistryError
-from weighttraj.format import Algorithm, Dataset, open_dataset
-from weighttraj.format.catalog import MANIFEST, check_file_names, write_manifest
-from weighttraj.format.locate import locate
-from weighttraj.format.objects import read_plain
-from weighttraj.format.tables import RUNS, SNAPSHOTS
+from weighttraj.format import Algorithm
+from weighttraj.locate import locate
+from weighttraj.opening import open_dataset
 from weighttraj.registry.croissant import CROISSANT, citation, croissant
+from weighttraj.store.catalog import MANIFEST, check_file_names, write_manifest
+from weighttraj.store.objects import read_plain
 from weighttraj.text import markdown, printable, yaml
+from weighttraj.tools.tables import RUNS, SNAPSHOTS
 
 CARD = "README.md"
 START, END = "<!-- facts, {}: rewrite with `weighttraj card` -->", "<!-- end of facts -->"

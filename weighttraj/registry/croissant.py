@@ -12,9 +12,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from weighttraj.format import Dataset
-from weighttraj.format.tables import RUNS, SNAPSHOTS, read_schema
+from weighttraj.dataset import Dataset
 from weighttraj.text import printable
+from weighttraj.tools.tables import RUNS, SNAPSHOTS, read_schema
 
 CROISSANT = "croissant.json"
 

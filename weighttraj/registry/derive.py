@@ -14,22 +14,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 
 from weighttraj.atomic import appearing
+from weighttraj.dataset import Dataset
 from weighttraj.errors import FormatError, RegistryError, WeightTrajError
-from weighttraj.format import (
-    Dataset,
-    DatasetInfo,
-    Run,
-    RunEntry,
-    open_dataset,
-    open_run,
-    pack,
-    seal,
-)
-from weighttraj.format.catalog import write_dataset_info
-from weighttraj.format.locate import locate
-from weighttraj.format.packing import copy_packed
-from weighttraj.format.storage import PACKED
+from weighttraj.format import DatasetInfo, RunEntry
+from weighttraj.locate import locate
+from weighttraj.opening import open_dataset, open_run
 from weighttraj.progress import LoggedProgress
+from weighttraj.run import Run
+from weighttraj.store.catalog import write_dataset_info
+from weighttraj.store.zarr_run import PACKED
+from weighttraj.tools.pack import copy_packed, pack
+from weighttraj.tools.repair import seal
 
 SPLITS = ("train", "validation", "test")
 """Parts of a data set."""

@@ -26,22 +26,25 @@ from rich.progress import (
 )
 
 from weighttraj.atomic import refuse_existing, replace_file
+from weighttraj.dataset import Dataset
 from weighttraj.errors import DamageError, FormatError, RegistryError, RemoteError, StoreLockedError
-from weighttraj.format import Dataset, RunEntry, open_dataset, seal
-from weighttraj.format.catalog import (
+from weighttraj.format import RunEntry
+from weighttraj.locate import VARIABLE, folders
+from weighttraj.opening import open_dataset
+from weighttraj.progress import LoggedProgress
+from weighttraj.registry.transfer import for_each
+from weighttraj.remote.address import RemotePath
+from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
+from weighttraj.store.catalog import (
     DATASET,
     MANIFEST,
     ManifestLine,
     parse_manifest,
     write_dataset_info,
 )
-from weighttraj.format.locate import VARIABLE, folders
-from weighttraj.format.packing import cut
-from weighttraj.format.storage import PACKED
-from weighttraj.progress import LoggedProgress
-from weighttraj.registry.transfer import for_each
-from weighttraj.remote.address import RemotePath
-from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
+from weighttraj.store.zarr_run import PACKED
+from weighttraj.tools.pack import cut
+from weighttraj.tools.repair import seal
 
 REQUEST = ".request.json"
 """File in a download that is not whole yet: which part of the runs it is of."""

@@ -8,9 +8,10 @@ from collections.abc import Collection
 
 from rich.console import Console
 
+from weighttraj.dataset import Dataset
 from weighttraj.errors import RegistryError
-from weighttraj.format import Dataset, open_dataset
-from weighttraj.format.locate import locate
+from weighttraj.locate import locate
+from weighttraj.opening import open_dataset
 from weighttraj.registry.download import download as fetch
 from weighttraj.registry.download import home, name_of, source_of
 from weighttraj.remote.address import RemotePath, below, is_remote

@@ -10,9 +10,10 @@ from functools import cached_property
 from pathlib import Path
 
 from weighttraj.errors import RegistryError
-from weighttraj.format import DatasetInfo, open_dataset
-from weighttraj.format.catalog import DATASET, read_dataset_info
-from weighttraj.format.locate import clone, folders, locate
+from weighttraj.format import DatasetInfo
+from weighttraj.locate import clone, folders, locate
+from weighttraj.opening import open_dataset
+from weighttraj.store.catalog import DATASET, read_dataset_info
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class LocalDataset:
 def local_datasets() -> list[LocalDataset]:
     """Every data set that can be named by an id here; of two with one id the one that is found.
 
-    See ``weighttraj.format.locate``: the folders of ``WEIGHTTRAJ_DATASETS_PATH``, the one for
+    See ``weighttraj.locate``: the folders of ``WEIGHTTRAJ_DATASETS_PATH``, the one for
     downloads, ``datasets`` of a clone, and ``data`` of the working directory.
     """
     found: dict[str, LocalDataset] = {}

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from weighttraj.errors import RegistryError, WeightTrajError, missing_extra
-from weighttraj.format import open_dataset
-from weighttraj.format.tables import HYPERPARAMETER, RUN_COLUMNS, RUNS, read_table, runs_table
+from weighttraj.opening import open_dataset
 from weighttraj.registry.local import LocalDataset, local_datasets
+from weighttraj.tools.tables import HYPERPARAMETER, RUN_COLUMNS, RUNS, read_table, runs_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 
-from weighttraj.format.catalog import ManifestLine
 from weighttraj.remote.wait import stop_with
+from weighttraj.store.catalog import ManifestLine
 
 AT_ONCE = 4
 """Files that are sent or fetched at the same time."""

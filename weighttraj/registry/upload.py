@@ -11,16 +11,19 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, TextColumn, TransferSpeedColumn
 
+from weighttraj.dataset import Dataset
 from weighttraj.errors import RegistryError
-from weighttraj.format import Dataset, lint, open_dataset, verify
-from weighttraj.format.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
-from weighttraj.format.locate import is_run, locate
-from weighttraj.format.objects import read_plain
+from weighttraj.locate import is_run, locate
+from weighttraj.opening import open_dataset
 from weighttraj.progress import LoggedProgress
 from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.hub import client, hub_error, pinned
 from weighttraj.remote.store import MAX_DOCUMENT, RemoteStore, store_at
+from weighttraj.store.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
+from weighttraj.store.objects import read_plain
+from weighttraj.tools.lint import lint
+from weighttraj.tools.verify import verify
 
 CLAIM = "UPLOADING.sha256"
 """Object that holds the manifest of what is being uploaded, for as long as it is."""
@@ -152,7 +155,7 @@ def upload_folder(
     A claim says whose they are until the last one is written.
 
     Args:
-        folder: it has a manifest, ``weighttraj.format.catalog.write_manifest``.
+        folder: it has a manifest, ``weighttraj.store.catalog.write_manifest``.
         place: address; ``file://`` folders are made.
         last: the file that readers begin with, written last.
         console: where progress is shown; None: nowhere.

@@ -1,0 +1,1 @@
+"""What one does with data that are already there: verify, repair, lint, pack, export, tables."""
