@@ -41,6 +41,3 @@ def fetch(address: str, revision: str | None = None) -> tuple[Path, str]:
     except (OSError, ValueError, RuntimeError) as error:  # the client's errors are such
         raise hub.hub_error(error, address) from error
     return Path(found), place.name
-
-
-__all__ = ["FILES", "VARIABLE", "fetch"]

@@ -130,6 +130,3 @@ def check_cadence(run: Run, every: int | None, phases: int | None = None) -> Non
             where=run.path,
             do="train a model on runs of this cadence",
         )
-
-
-__all__ = ["Forecaster", "check_cadence", "check_forecaster", "check_request"]

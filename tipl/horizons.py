@@ -45,6 +45,3 @@ def too_short(horizons: Sequence[int]) -> TrainError:
         expected=f"runs of more than {max(horizons) + 2} snapshots",
         do="train for fewer horizons, or collect longer runs",
     )
-
-
-__all__ = ["HORIZONS", "fitted", "rows_of", "too_short"]

@@ -292,20 +292,3 @@ for _kind in (
     _baseline("reconstruction", "reconstruction:Reconstruction"),
 ):
     register(_kind)
-
-__all__ = [
-    "MODELS",
-    "Kind",
-    "commands",
-    "folder_of",
-    "imported",
-    "is_model",
-    "kind_in",
-    "kind_of",
-    "kinds",
-    "load",
-    "load_folder",
-    "names",
-    "register",
-    "unfitted",
-]

@@ -143,14 +143,3 @@ def without_faults(
 
 _KNOWN: WeakKeyDictionary[Run, CachedWeights | np.ndarray] = WeakKeyDictionary()
 _CHECKSUMS: WeakKeyDictionary[Run, str] = WeakKeyDictionary()
-
-__all__ = [
-    "Rows",
-    "cache_in",
-    "checksum_of",
-    "columns_of",
-    "fault_of",
-    "stratified",
-    "weights_of",
-    "without_faults",
-]

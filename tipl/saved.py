@@ -256,18 +256,3 @@ def _difference(expected: Mapping[str, tuple[int, ...]], got: Mapping[str, tuple
         return f"Unexpected key {more[0]}"
     name = next(name for name in expected if expected[name] != got[name])
     return f"{name} of shape {got[name]}, not {expected[name]}"
-
-
-__all__ = [
-    "ARRAYS",
-    "CONFIG",
-    "SavedNetwork",
-    "broken",
-    "fingerprint",
-    "header_of",
-    "load_network",
-    "read_arrays",
-    "read_config",
-    "read_settings",
-    "write",
-]

@@ -48,6 +48,3 @@ def _told(value: Any) -> str:
     if isinstance(value, tuple | list):
         return " ".join(map(str, value)) or "empty"
     return str(value)
-
-
-__all__ = ["check_heads", "check_settings"]

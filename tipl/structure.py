@@ -89,6 +89,3 @@ def _kind(role: str, axes: tuple[str, ...]) -> int:
     }
     place = "output" if "action" in axes else "input" if "observation" in axes else "hidden"
     return KINDS.index(names.get((role, place), "other"))
-
-
-__all__ = ["Clock", "Structure"]

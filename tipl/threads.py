@@ -23,6 +23,3 @@ def threads(count: int = 1) -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(before)
-
-
-__all__ = ["threads"]

@@ -175,15 +175,3 @@ def _moments(run: Run, group: str) -> list[tuple[np.ndarray, np.ndarray, float]]
     mean, var, count = (run[f"{group}/{name}"][:] for name in ("mean", "var", "count"))
     rows = zip(mean, var, count.tolist(), strict=True)
     return [(np.asarray(m), np.asarray(v), n) for m, v, n in rows]
-
-
-__all__ = [
-    "WALK",
-    "Moments",
-    "RefitConfig",
-    "adam_of",
-    "as_dataset",
-    "random_symmetry",
-    "random_walks",
-    "run_like",
-]

@@ -264,18 +264,3 @@ def _relative(error: np.ndarray, moved: np.ndarray) -> float:
         return 0.0
     size = np.linalg.norm(np.asarray(moved, np.float64) * np.ones_like(error))
     return float(np.linalg.norm(error) / max(size, np.finfo(float).tiny))
-
-
-__all__ = [
-    "GRID",
-    "NULL",
-    "TOLERANCE",
-    "Checks",
-    "Fit",
-    "causality",
-    "check",
-    "drift",
-    "equivariance",
-    "scale",
-    "skills",
-]

@@ -83,6 +83,3 @@ def check_model(
         "passed": found.passed,
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     }
-
-
-__all__ = ["check_model", "refit_of"]

@@ -136,6 +136,3 @@ def _overview(
         texts = (cell(cells[i], interval=interval) for i in shown)
         table.add_row(label(name), *(escape(text) for text in texts))
     return table
-
-
-__all__ = ["check", "evaluate", "report"]

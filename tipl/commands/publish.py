@@ -55,6 +55,3 @@ def push(
 ) -> None:
     """Publish a model with its card, on the Hugging Face hub or in an object store."""
     say(f"published: {push_model(model, address, private=private, card=card)}")
-
-
-__all__ = ["card", "push", "release"]

@@ -35,6 +35,3 @@ def _stop(*_: object) -> NoReturn:
     """Treat SIGTERM, with which `torchrun` and schedulers end a process, as Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # some send it twice
     raise KeyboardInterrupt
-
-
-__all__ = ["trainer"]

@@ -29,6 +29,3 @@ def zoo() -> None:
         cells = zip(listed(name, interval=wide), columns.values(), strict=True)
         table.add_row(*(escape(text) for text, shown in cells if shown))
     console.print(table)
-
-
-__all__ = ["zoo"]

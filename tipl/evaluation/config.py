@@ -65,6 +65,3 @@ class EvaluateConfig:
             plateau_starts=min(self.plateau_starts, 1),
             episodes=min(self.episodes, 5),
         )
-
-
-__all__ = ["EvaluateConfig"]

@@ -228,6 +228,3 @@ def _totals(tasks: Sequence[Task]) -> dict[str, int]:
         forecasts = (1 + n) * len(config.return_horizons)
         totals["returns"] += len(MODES) * of_returns * (1 + forecasts)
     return totals
-
-
-__all__ = ["evaluate"]

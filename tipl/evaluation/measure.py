@@ -197,6 +197,3 @@ class _Measurement(contextlib.ExitStack):
             ),
             ("returns", len(MODES) * len(starts) * len(config.return_horizons)),
         )
-
-
-__all__ = ["Measured", "Task", "function_starts", "measure"]

@@ -61,6 +61,3 @@ def _write(path: Path, source: str, arrays: Arrays) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         np.savez_compressed(file, source=np.array(source), **arrays)  # type: ignore[arg-type]
-
-
-__all__ = ["Arrays", "Parts", "run_source"]

@@ -163,19 +163,3 @@ def write_results(file: Path, results: Results) -> None:
 def encoded(document: Any) -> str:
     """Return a document as JSON text."""
     return msgspec.json.format(msgspec.json.encode(document), indent=1).decode() + "\n"
-
-
-__all__ = [
-    "GainRow",
-    "Interval",
-    "Measure",
-    "Points",
-    "Results",
-    "Row",
-    "Rows",
-    "Scores",
-    "StartCounts",
-    "encoded",
-    "read_results",
-    "write_results",
-]

@@ -128,6 +128,3 @@ def _keys(policies: PolicyBatch) -> list[bytes]:
     """What tells one policy from another: its weights and its normaliser."""
     parts = [x for x in (policies.weights, policies.mean, policies.var) if x is not None]
     return [b"".join([part[row].tobytes() for part in parts]) for row in range(len(policies))]
-
-
-__all__ = ["FRESH", "MODES", "Player", "forecast_returns", "true_returns"]

@@ -108,6 +108,3 @@ def _sample(last: int, count: int) -> Int[np.ndarray, " start"]:
 def _spread(first: int, last: int, count: int) -> Int[np.ndarray, " start"]:
     """So many integers, evenly from the first to the last."""
     return np.unique(np.linspace(first, last, min(count, last - first + 1)).round().astype(int))
-
-
-__all__ = ["DENSE", "LEARNED", "Starts", "at_boundary", "learning_phase", "shares", "starts_of"]

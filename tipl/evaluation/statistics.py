@@ -91,6 +91,3 @@ def _intervals(
 
 def _plain(value: np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-__all__ = ["Bootstrap", "Cell", "interquartile_mean", "mean", "quotient", "ratio_of_sums"]

@@ -258,6 +258,3 @@ _SKILLS: dict[str, Callable[..., np.ndarray]] = {
 def _mean(values: np.ndarray) -> np.ndarray:
     """Mean over the first axis; NaN where there is nothing."""
     return mean(values) if len(values) else np.full(values.shape[1:], np.nan)
-
-
-__all__ = ["AGGREGATES", "KINDS", "NEAR", "PHASES", "Summary"]

@@ -108,6 +108,3 @@ def _later(
 
 def _widest(run: Run) -> int:
     return max(max(param.shape, default=1) for param in run.layout.params)
-
-
-__all__ = ["MAX_BYTES", "Tick", "divergences", "squared_errors"]

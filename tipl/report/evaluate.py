@@ -44,6 +44,3 @@ def evaluate(
     results = measure(forecasters, config, workers=workers, imports=imports, console=console)
     write_report(results, config.out)
     return results
-
-
-__all__ = ["evaluate"]

@@ -245,6 +245,3 @@ def svg(fig: Figure) -> str:
     with mpl.rc_context({"svg.hashsalt": "weighttraj"}):
         fig.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue().split("?>", 1)[-1]
-
-
-__all__ = ["figures", "file_name", "styles", "svg", "titles"]

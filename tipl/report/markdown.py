@@ -201,6 +201,3 @@ def _draw(results: Results, folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     for title, figure in figures(results).items():
         figure.savefig(folder / file_name(title), dpi=DPI)
-
-
-__all__ = ["Place", "insert_markdown", "places", "render", "rewrite", "table_lines"]

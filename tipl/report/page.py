@@ -31,6 +31,3 @@ def write_report(results: Results, out: Path) -> Path:
     path = out / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
-
-
-__all__ = ["write_report"]

@@ -94,23 +94,3 @@ def shown(results: Results) -> list[str]:
     if h is not None:
         chosen += best(results, others, GAIN, h)
     return list(dict.fromkeys(chosen))
-
-
-__all__ = [
-    "GAIN",
-    "PERSISTENCE",
-    "REPW",
-    "SKILL",
-    "baselines",
-    "best",
-    "function_skill",
-    "gain",
-    "gain_horizon",
-    "models",
-    "oracles",
-    "repw",
-    "row_at",
-    "shown",
-    "skill",
-    "wpe",
-]

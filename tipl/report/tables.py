@@ -139,6 +139,3 @@ def _horizons(results: Results, measure: Measure, usual: Sequence[int]) -> list[
     if measure is SKILL and len(measured) <= FEW:
         return measured
     return [h for h in usual if h in measured] or measured[-1:]
-
-
-__all__ = ["MODE_NAMES", "Table", "cell", "headline", "label", "tables"]

@@ -142,6 +142,3 @@ def _rivals(results: Results) -> list[str]:
         for first in best(results, names, measure, h)
     ]
     return [f"Best of {len(names)} baselines: {'; '.join(found)}."] if found else []
-
-
-__all__ = ["paragraphs", "verdict"]

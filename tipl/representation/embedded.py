@@ -39,5 +39,3 @@ def embed(run: Run, rank: int) -> Embedded:
 
 
 _KNOWN: WeakKeyDictionary[Run, dict[int, Embedded]] = WeakKeyDictionary()
-
-__all__ = ["Embedded", "embed"]

@@ -136,6 +136,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     return str(value) if isinstance(value, Path) else value
-
-
-__all__ = ["LoopConfig", "change", "flat"]

@@ -351,6 +351,3 @@ def _cannot(config: LoopConfig, error: Exception) -> TrainError:
         where=where,
         do="choose --dtype float32, or another --device",
     )
-
-
-__all__ = ["Examples", "Learner", "train_network"]

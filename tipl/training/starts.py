@@ -239,15 +239,3 @@ def draw_starts(length: int, count: int, rng: np.random.Generator) -> list[int]:
     even, early = 1 + u * last, np.exp(u * np.log(last + 1))
     drawn = np.where(np.arange(count) % 2, even, early).astype(int)
     return np.unique(np.clip(drawn, 1, last)).tolist()  # type: ignore[no-any-return]
-
-
-__all__ = [
-    "Example",
-    "StartExamples",
-    "StartsConfig",
-    "StartsLearner",
-    "cadence_of",
-    "draw_starts",
-    "fault_in_training",
-    "gather",
-]

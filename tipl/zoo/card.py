@@ -313,13 +313,3 @@ _SECTIONS: dict[str, Callable[[Metrics], str]] = {
     "training": _training,
     "commands": _commands,
 }
-
-
-__all__ = [
-    "facts",
-    "metrics_of",
-    "new_card",
-    "refreshed",
-    "training_figure",
-    "write_card",
-]

@@ -25,6 +25,3 @@ def listed(name: str, *, interval: bool = True) -> tuple[str, ...]:
     figures = [cell(row, interval=interval) for row in rows]
     causal = "yes" if metrics.causal else "no"
     return (name, metrics.kind, causal, metrics.results.data, *figures)
-
-
-__all__ = ["HEADLINE", "listed"]

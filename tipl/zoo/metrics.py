@@ -89,6 +89,3 @@ def read_metrics(folder: Path) -> Metrics | None:
 def write_metrics(folder: Path, metrics: Metrics) -> None:
     """Put the file beside the model."""
     (folder / FILE).write_text(encoded(metrics), encoding="utf-8")
-
-
-__all__ = ["FILE", "Metrics", "TrainedOn", "read_metrics", "write_metrics"]

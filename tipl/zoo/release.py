@@ -268,6 +268,3 @@ def _of_one(data: str, runs: dict[str, str]) -> TrainedOn:
 def _json(file: Path) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     return found
-
-
-__all__ = ["LINES", "MOST", "reduced", "release", "thinned"]

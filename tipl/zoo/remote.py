@@ -94,6 +94,3 @@ def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None
             where=model if isinstance(model, str | Path) else type(model).__name__,
             do="write one: what it forecasts, what it was trained on, its figures, its limits",
         )
-
-
-__all__ = ["push"]

@@ -34,6 +34,3 @@ def features_of(settings: Mapping[str, Any]) -> Features:
     if kind not in FEATURES:
         raise ValueError(f"features of kind {kind!r}; there are {sorted(FEATURES)}")
     return msgspec.convert(fields, FEATURES[kind])
-
-
-__all__ = ["FEATURES", "features_of"]

@@ -126,6 +126,3 @@ def _tensors(layout: ParamLayout) -> tuple[np.ndarray, np.ndarray]:
     sizes = [param.size for param in layout.params]
     matrix = [param.role == "weight" for param in layout.params]
     return np.repeat(np.arange(len(sizes)), sizes), np.repeat(matrix, sizes)
-
-
-__all__ = ["SAMPLE", "Trajectory", "renewal", "samples", "thinned"]

@@ -39,6 +39,3 @@ class EndPoints(Features):
         for place, window in trajectory.windows(starts, self.context - 1):
             last = window[-1]
             yield place, last, np.stack([window[0], last, np.ones_like(last)])
-
-
-__all__ = ["EndPoints"]

@@ -43,6 +43,3 @@ class Features(ABC):
     def settings(self) -> dict[str, Any]:
         """JSON of what these features are."""
         return {"kind": self.kind, **vars(self)}
-
-
-__all__ = ["Features", "Inputs"]

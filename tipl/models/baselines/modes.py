@@ -116,6 +116,3 @@ def _affine(
     known = np.maximum(squared[references], np.finfo(float).tiny)
     mine = (np.abs(products) / np.sqrt(known)[:, None]).argmax(0)
     return mine, products[mine, np.arange(len(squared))] / known[mine]
-
-
-__all__ = ["ModeSteps", "cluster", "find_references"]

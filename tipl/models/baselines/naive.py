@@ -101,6 +101,3 @@ class Extrapolation(Forecaster):
         if velocity.size != 1:
             raise broken(path, f"a velocity of {velocity.size:.3g} features, not of 1")
         return cls(velocity)
-
-
-__all__ = ["Extrapolation", "Persistence"]

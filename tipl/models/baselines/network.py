@@ -136,6 +136,3 @@ def _zero(layer: nn.Linear) -> nn.Linear:
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
     return layer
-
-
-__all__ = ["ParameterRows", "PerParameter", "Perceptron", "Streams", "loss_of", "standardise"]

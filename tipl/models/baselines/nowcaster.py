@@ -276,6 +276,3 @@ def _filled(
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))
-
-
-__all__ = ["Nowcaster", "NowcasterConfig", "NowcasterFit"]

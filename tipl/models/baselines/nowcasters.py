@@ -106,6 +106,3 @@ def _layer_scales(
     mean = (np.bincount(tensor, window.mean(0)) / counts)[tensor]
     squares = np.bincount(tensor, ((window - mean) ** 2).mean(0)) / counts
     return mean, (np.sqrt(squares) + 1e-6)[tensor]
-
-
-__all__ = ["WNN", "NinoMLP"]

@@ -68,6 +68,3 @@ class Reconstruction(Forecaster):
             ModelError: the folder holds another one.
         """
         return read_config(path, cls.kind, cls)
-
-
-__all__ = ["Reconstruction"]

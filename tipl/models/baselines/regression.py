@@ -253,6 +253,3 @@ class _Sums:
     def solve(self) -> Float64[np.ndarray, "horizon feature"]:
         pairs = zip(self.left, self.right, strict=True)
         return np.stack([np.linalg.lstsq(a, b, rcond=1e-12)[0] for a, b in pairs])
-
-
-__all__ = ["Regression", "RegressionFit"]

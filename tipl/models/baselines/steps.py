@@ -116,6 +116,3 @@ class Ema(Features):
                 mean = self.beta * mean + (1 - self.beta) * (row - last)
                 last = row
             yield place, last, (mean / max(1 - self.beta ** (t - origin), 1e-300))[None]
-
-
-__all__ = ["Ema", "Slope", "Steps", "last_steps"]

@@ -160,6 +160,3 @@ def _sums(
     """x + x^2 + ... + x^h of each eigenvalue."""
     powers = values[None] ** np.arange(1, max(horizons) + 1)[:, None]
     return np.asarray(powers.cumsum(0)[np.asarray(horizons) - 1])
-
-
-__all__ = ["DMD", "ProjectedSteps", "prefix_basis"]

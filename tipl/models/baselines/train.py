@@ -173,13 +173,3 @@ def refit_nowcaster(old: Nowcaster, runs: Sequence[Run], config: RefitConfig) ->
         seed=config.seed,
         training=replace(LOOP, n_batches=config.batches, save_every=max(1, config.batches // 10)),
     )
-
-
-__all__ = [
-    "BaselinesConfig",
-    "fit_baselines",
-    "refit_nowcaster",
-    "refit_regression",
-    "save_baselines",
-    "train_baselines",
-]

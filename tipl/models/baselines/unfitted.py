@@ -17,5 +17,3 @@ UNFITTED: tuple[Forecaster, ...] = (
     DMD(),
 )
 """All of them."""
-
-__all__ = ["BETAS", "UNFITTED"]

@@ -142,5 +142,3 @@ def bases_of(run: Run, config: CausalConfig, ahead: int = 0) -> PrefixBases:
 
 
 _KNOWN: WeakKeyDictionary[Run, dict[tuple[int, int, int], PrefixBases]] = WeakKeyDictionary()
-
-__all__ = ["SCALE_STEPS", "CausalExamples", "bases_of", "examples_of", "local_scale", "view"]

@@ -95,6 +95,3 @@ class Causal(SavedNetwork[CausalGPT, CausalModelConfig]):
         names = ("tokens", "phases", "mask", "state")
         moved = self.network(*(seen[name][None] for name in names))[0]  # (horizon, rank)
         return np.asarray((moved.numpy() * scale) @ bases.basis(t).components)
-
-
-__all__ = ["Causal", "CausalModelConfig"]

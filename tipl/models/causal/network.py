@@ -99,6 +99,3 @@ class CausalGPT(nn.Module):
         last = self.final_norm(x[:, -1])  # (batch, n_embd)
         moved: Tensor = self.head(last).view(len(tokens), -1, self.config.rank)
         return moved * self.root
-
-
-__all__ = ["CausalConfig", "CausalGPT"]

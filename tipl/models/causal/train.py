@@ -125,6 +125,3 @@ def refit(old: Causal, runs: Sequence[wt.Run], config: RefitConfig) -> Causal:
             training=loop,
         )
     )
-
-
-__all__ = ["CausalLearner", "CausalTrainConfig", "refit", "train_causal"]

@@ -84,6 +84,3 @@ class _ReadAhead:
             self._first = t
             self._block = self._array[t : min(t + 1 + self._ahead, self._last + 1)]
         return np.asarray(self._block[t - self._first], np.float64)
-
-
-__all__ = ["Adam", "AdamReader"]

@@ -121,6 +121,3 @@ def _filled(values: Float[Tensor, "few *shape"] | Int[Tensor, " few"]) -> Tensor
     """Append zeros up to the number of parameters in an example."""
     missing = PARAMS - len(values)
     return torch.cat([values, values.new_zeros(missing, *values.shape[1:])])
-
-
-__all__ = ["PARAMS", "POOL", "GateExamples", "examples_of"]

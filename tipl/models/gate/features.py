@@ -232,6 +232,3 @@ def _shared(
 ) -> Float[Tensor, " param"]:
     """For each parameter the mean over those that share its place."""
     return (torch.bincount(place, values) / torch.bincount(place))[place].to(values.dtype)
-
-
-__all__ = ["Features", "features", "pieces"]

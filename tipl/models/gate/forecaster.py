@@ -117,6 +117,3 @@ class Gate(SavedNetwork[GateNetwork, GateModelConfig]):
                 inputs, basis = seen.of(some)
                 parts.append(self.network.of_one_tensor(inputs, seen.contexts[number], basis, rows))
         return torch.cat(parts, dim=1)
-
-
-__all__ = ["Gate", "GateModelConfig"]

@@ -107,5 +107,3 @@ def histories(
 
 
 _WALKS: WeakKeyDictionary[Run, dict[tuple[int, tuple[float, ...]], History]] = WeakKeyDictionary()
-
-__all__ = ["History", "histories"]

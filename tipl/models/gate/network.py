@@ -185,6 +185,3 @@ def _basis_scale(config: GateConfig) -> Float[Tensor, "basis horizon"]:
     if config.adam:
         rows.append(steps[0])
     return torch.tensor(rows)
-
-
-__all__ = ["LAG_COSINES", "GateConfig", "GateNetwork", "Input"]

@@ -145,6 +145,3 @@ def refit(old: Gate, runs: Sequence[wt.Run], config: RefitConfig) -> Gate:
             training=loop,
         )
     )
-
-
-__all__ = ["GateLearner", "GateTrainConfig", "refit", "relative_error", "train_gate"]

@@ -171,6 +171,3 @@ def _factors(
         if param.name == "log_std":
             factors[:, param.slice] = 1
     return factors
-
-
-__all__ = ["Scaled", "ScaledGate"]

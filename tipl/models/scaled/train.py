@@ -252,6 +252,3 @@ def refit(old: ScaledGate, runs: Sequence[wt.Run], config: RefitConfig) -> Scale
     horizons = tuple(h for h in config.horizons if h in old.amplitudes)
     gate = refit_gate(old.gate, runs, replace(config, horizons=horizons))
     return ScaledGate(gate, {h: old.amplitudes[h] for h in horizons})
-
-
-__all__ = ["MODE", "ScaledTrainConfig", "gains_of", "refit", "train_scaled"]

@@ -242,6 +242,3 @@ def _tokens(run: wt.Run, rank: int) -> TokenRun:
             where=run.path,
             do="change --rank, or leave the run out",
         ) from error
-
-
-__all__ = ["Prepared", "TokenRun", "TokenSampler", "Windows", "history", "prepare"]

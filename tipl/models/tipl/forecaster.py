@@ -116,6 +116,3 @@ class TIPL(SavedNetwork[GPT, TIPLConfig]):
                 where=run.path,
                 do="train on longer runs, or forecast earlier starts",
             )
-
-
-__all__ = ["TIPL", "TIPLConfig"]

@@ -144,6 +144,3 @@ def _init_gpt2(module: nn.Module) -> None:
     if isinstance(module, nn.Linear):
         nn.init.normal_(module.weight, std=0.02)
         nn.init.zeros_(module.bias)
-
-
-__all__ = ["GPT", "Block", "GPTConfig", "attention_mask"]

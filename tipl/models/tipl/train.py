@@ -203,6 +203,3 @@ def refit(old: TIPL, runs: Sequence[wt.Run], config: RefitConfig) -> TIPL:
             training=loop,
         )
     )
-
-
-__all__ = ["TIPLLearner", "TrainConfig", "refit", "train", "weight_prediction_error"]
