@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import weighttraj as wt
 from tipl import TemporalSVD
 from tipl.errors import RepresentationError
-from tipl.representation import PrefixBases, RunOrRows, fit_run, fit_shared, rows, svd
+from tipl.representation import PrefixBases, fit_run, rows, svd
 
 
 def path(n: int = 60, size: int = 30, seed: int = 0) -> np.ndarray:
@@ -221,66 +221,31 @@ def test_a_large_run_is_streamed_and_a_small_one_is_not(monkeypatch: pytest.Monk
     assert found.components.tobytes() == streamed.components.tobytes()
 
 
-def test_a_shared_basis_is_that_of_all_snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = [path(60, seed=0), path(40, seed=1)]
-    shared = fit_shared(runs, rank=3)
-    whole = np.concatenate(runs)
-    early = np.concatenate([run[: len(run) // 10] for run in runs])
-    _, s, vt = np.linalg.svd(whole, full_matrices=False)
-    np.testing.assert_allclose(shared.singular_values, s[:3], rtol=1e-12)
-    np.testing.assert_allclose(np.abs(shared.components), np.abs(vt[:3]), atol=1e-10)
-    assert (shared.transform(early).sum(0) > 0).all()
-    assert shared.total_energy == pytest.approx(np.sum(whole**2))
-    monkeypatch.setattr(svd, "EXACT_WORK", 0)
-    streamed = fit_shared(runs, rank=3)
-    np.testing.assert_allclose(streamed.components, shared.components, atol=1e-10)
-
-
-def test_a_shared_basis_fails_on_runs_of_other_seeds() -> None:
-    """Runs that begin at initialisations of their own, and go ways of their own."""
-    rng = np.random.default_rng(0)
-    starts = rng.normal(size=(9, 1, 2000))
-    ways = 0.02 * rng.normal(size=(9, 100, 2000)).cumsum(1)
-    *seen, unseen = starts + ways
-    shared = fit_shared(seen, rank=64)
-    own = TemporalSVD.fit(unseen, rank=64)
-    seen_lost = np.mean([shared.reconstruction_error(run) for run in seen])
-    persistence = np.mean((unseen - unseen[:1]) ** 2)
-    assert shared.reconstruction_error(unseen) > 0.9 * np.mean(unseen**2)
-    assert shared.reconstruction_error(unseen) > 10 * persistence
-    assert shared.reconstruction_error(unseen) > 100 * max(
-        seen_lost, own.reconstruction_error(unseen)
-    )
-
-
 @pytest.mark.parametrize("size", [12, 200], ids=["fewer parameters", "more parameters"])
 @pytest.mark.parametrize("window", [None, 40])
 def test_bases_of_prefixes_are_those_of_the_prefixes_alone(size: int, window: int | None) -> None:
     weights = path(150, size)
-    starts = [10, 11, 39, 40, 90, 149]
-    for kind in ("displacements", "snapshots"):
-        bases = PrefixBases.fit(weights, rank=6, kind=kind, window=window)
-        for t in starts:
-            first = 0 if window is None else max(0, t - window + 1)
-            seen = weights[first : t + 1] - (weights[t] if kind == "displacements" else 0)
-            direct, basis, tokens = TemporalSVD.fit(seen, rank=6), bases.basis(t), bases.tokens(t)
-            assert tokens.first == first
-            np.testing.assert_allclose(tokens.coefficients, direct.transform(seen), atol=1e-9)
-            np.testing.assert_allclose(basis.components, direct.components, atol=1e-9)
-            np.testing.assert_allclose(basis.singular_values, direct.singular_values, rtol=1e-9)
-            assert basis.total_energy == pytest.approx(direct.total_energy, rel=1e-9)
+    bases = PrefixBases.fit(weights, rank=6, window=window)
+    for t in (10, 11, 39, 40, 90, 149):
+        first = 0 if window is None else max(0, t - window + 1)
+        seen = weights[first : t + 1] - weights[t]
+        direct, basis, tokens = TemporalSVD.fit(seen, rank=6), bases.basis(t), bases.tokens(t)
+        assert tokens.first == first
+        np.testing.assert_allclose(tokens.coefficients, direct.transform(seen), atol=1e-9)
+        np.testing.assert_allclose(basis.components, direct.components, atol=1e-9)
+        np.testing.assert_allclose(basis.singular_values, direct.singular_values, rtol=1e-9)
+        assert basis.total_energy == pytest.approx(direct.total_energy, rel=1e-9)
 
 
 @pytest.mark.parametrize("size", [12, 200])
 def test_what_follows_a_start_is_given_in_its_basis(size: int) -> None:
     weights = path(150, size)
-    for kind in ("displacements", "snapshots"):
-        bases = PrefixBases.fit(weights, rank=5, kind=kind, window=40, ahead=7)
-        for t, count in ((20, 28), (100, 47), (145, 44), (149, 40)):
-            tokens, basis = bases.tokens(t), bases.basis(t)
-            around = weights[tokens.first : t + 8] - (weights[t] if kind == "displacements" else 0)
-            assert len(tokens.coefficients) == len(around) == count
-            np.testing.assert_allclose(tokens.coefficients, basis.transform(around), atol=1e-9)
+    bases = PrefixBases.fit(weights, rank=5, window=40, ahead=7)
+    for t, count in ((20, 28), (100, 47), (145, 44), (149, 40)):
+        tokens, basis = bases.tokens(t), bases.basis(t)
+        around = weights[tokens.first : t + 8] - weights[t]
+        assert len(tokens.coefficients) == len(around) == count
+        np.testing.assert_allclose(tokens.coefficients, basis.transform(around), atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [12, 200])
@@ -288,12 +253,11 @@ def test_no_basis_sees_what_comes_after_its_start(size: int) -> None:
     weights = path(150, size)
     changed = weights.copy()
     changed[101:] += 5 * np.random.default_rng(1).normal(size=(49, size))
-    for kind in ("displacements", "snapshots"):
-        one, other = (PrefixBases.fit(w, rank=5, kind=kind, window=40) for w in (weights, changed))
-        for t in (50, 99, 100):
-            assert one.tokens(t).coefficients.tobytes() == other.tokens(t).coefficients.tobytes()
-            assert one.basis(t).components.tobytes() == other.basis(t).components.tobytes()
-        assert one.tokens(101).coefficients.tobytes() != other.tokens(101).coefficients.tobytes()
+    one, other = (PrefixBases.fit(w, rank=5, window=40) for w in (weights, changed))
+    for t in (50, 99, 100):
+        assert one.tokens(t).coefficients.tobytes() == other.tokens(t).coefficients.tobytes()
+        assert one.basis(t).components.tobytes() == other.basis(t).components.tobytes()
+    assert one.tokens(101).coefficients.tobytes() != other.tokens(101).coefficients.tobytes()
 
 
 def test_steps_that_are_tiny_beside_the_weights_keep_their_digits() -> None:
@@ -351,24 +315,13 @@ def test_weights_that_are_not_finite_are_refused(monkeypatch: pytest.MonkeyPatch
     for fit in fits:
         with pytest.raises(RepresentationError, match=r"not finite(.|\n)*snapshot 33\n.*leave the"):
             fit(weights, 3)
-    with pytest.raises(RepresentationError, match="snapshot 33"):
-        fit_shared([path(), weights], 3)
 
 
-@pytest.mark.parametrize(
-    ("trajectories", "message"),
-    [
-        ([path(60, 30), path(60, 31)], r"shapes \[\(60, 30\), \(60, 31\)\](.|\n)*of one data set"),
-        ([np.zeros((60, 3, 10))], r"matrices \(time, param\)"),
-        ([], r"shapes \[\]"),
-        ([np.zeros((0, 30))], "nothing to represent(.|\n)*first snapshots"),
-    ],
-)
-def test_matrices_that_are_no_trajectories_are_refused(
-    trajectories: list[RunOrRows], message: str
-) -> None:
+@pytest.mark.parametrize("shape", [(60, 3, 10), (60,), (0, 30), (60, 0)])
+def test_matrices_that_are_no_trajectories_are_refused(shape: tuple[int, ...]) -> None:
+    message = r"matrix \(time, param\)(.|\n)*" + str(shape).replace("(", r"\(").replace(")", r"\)")
     with pytest.raises(RepresentationError, match=message):
-        fit_shared(trajectories, rank=3)
+        fit_run(np.zeros(shape), rank=3)
 
 
 @pytest.mark.parametrize("wrong", ["oversampling", "power_iterations", "seed", "piece"])
@@ -396,7 +349,6 @@ def test_starts_without_a_basis_are_refused() -> None:
         bases.basis(60)
     with pytest.raises(RepresentationError, match=r"0 to 59\n.*-1"):
         bases.basis(-1)
-    assert PrefixBases.fit(path(), rank=5, kind="snapshots").tokens(4).first == 0
 
 
 @pytest.mark.parametrize("size", [12, 200])

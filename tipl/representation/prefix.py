@@ -1,9 +1,8 @@
 """Bases that have seen nothing after a start, for many starts of a run.
 
-The basis at t is an SVD of what came before: of the displacements ``phi_s - phi_t``, or of the
-snapshots themselves, for s up to t; of all of them, or of the last ``window``. It comes from the
-eigenvectors of the smaller of its two Gram matrices. When that is the one of snapshots, its entries
-for all starts are inner products of neighbouring rows, which are taken once.
+The basis at t is an SVD of the displacements ``phi_s - phi_t`` for s up to t: of all of them, or of
+the last ``window``. It comes from the eigenvectors of the smaller one of its two Gram matrices.
+When that is (snapshot, snapshot), its entries for all starts come from one reading of the run.
 
 For T snapshots of P parameters, a window of W (all: W = T) and d directions, in multiplications:
 
@@ -22,18 +21,14 @@ InvertedPendulum (T = 1,951, P = 122) take 5 ms a start.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from tipl.errors import RepresentationError
 from tipl.representation.gram import Band, Held
-from tipl.representation.rows import RunOrRows, Stack, matrix_of, spans
+from tipl.representation.rows import RunOrRows, Snapshots, spans
 from tipl.representation.svd import TemporalSVD, check_rank, signs_of
-
-Kind = Literal["displacements", "snapshots"]
-"""Of what a basis is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +38,10 @@ class PrefixTokens:
     first: int
     """The first snapshot that the basis has seen."""
     coefficients: Float[np.ndarray, "snapshot rank"]
-    """Of ``phi_s - phi_t`` (or of phi_s), s from ``first``: rows of U up to t, and then, in the
-    same units, as many snapshots as were asked for with ``ahead`` and the run has."""
+    """Coefficients of ``phi_s - phi_t``, s from ``first``: rows of U up to t, and then the
+    snapshots that were asked for with ``ahead``, in the same units."""
     singular_values: Float[np.ndarray, " rank"]
-    """Of the prefix, falling."""
+    """Singular values of the prefix, falling."""
     total_energy: float
     """Squared Frobenius norm of the prefix."""
 
@@ -68,130 +63,105 @@ class PrefixBases:
     True
     """
 
-    trajectory: RunOrRows
-    """The run."""
     rank: int
-    """Directions d."""
-    kind: Kind
-    """Of what the bases are."""
+    """Number of directions d."""
     window: int
-    """Snapshots that a basis sees at most, up to and with its start."""
+    """Largest number of snapshots that a basis sees, its start included."""
     ahead: int
-    """Snapshots after a start whose coefficients ``tokens`` gives too."""
-    _length: int = field(repr=False)
+    """Number of snapshots after a start whose coefficients ``tokens`` returns too."""
+    _snapshots: Snapshots = field(repr=False)
     _grams: Band | Held = field(repr=False)
 
     @classmethod
     def fit(
-        cls,
-        trajectory: RunOrRows,
-        rank: int,
-        *,
-        kind: Kind = "displacements",
-        window: int | None = None,
-        ahead: int = 0,
+        cls, trajectory: RunOrRows, rank: int, *, window: int | None = None, ahead: int = 0
     ) -> PrefixBases:
-        """Read a run once, and take what all bases need.
+        """Read a run once, and keep what all bases need.
 
         Args:
             trajectory: the run, or the matrix of its weights.
-            rank: directions d.
-            kind: ``displacements``: of ``phi_s - phi_t``, the path as seen from its end;
-                ``snapshots``: of phi_s, uncentred.
-            window: snapshots that a basis sees at most, up to and with its start; None: all.
-            ahead: snapshots after a start whose coefficients are wanted, as the targets of a
-                training. No basis sees them.
+            rank: number of directions d.
+            window: largest number of snapshots that a basis sees; None: all.
+            ahead: number of snapshots after a start whose coefficients are wanted, for example as
+                targets of a training. No basis sees them.
 
         Raises:
             RepresentationError: no prefix has such a rank, or a value is not finite.
         """
-        stack = Stack([trajectory])
-        length, size = stack.shape
+        snapshots = Snapshots(trajectory)
+        length, size = snapshots.shape
         window = length if window is None else min(window, length)
-        moved = kind == "displacements"
-        if not (1 <= rank <= min(window - moved, size) and ahead >= 0):
+        most = min(window - 1, size)
+        if not (1 <= rank <= most and ahead >= 0):
             raise RepresentationError(
                 "no prefix of the run has such a basis",
-                expected=f"a rank from 1 to {min(window - moved, size)}, for the {kind} of "
+                expected=f"a rank from 1 to {most}, for the displacements of "
                 f"{window} snapshots of {size} parameters; ahead from 0",
                 got=f"rank {rank}, ahead {ahead}",
-                where=stack.where,
+                where=snapshots.where,
                 do="choose a smaller rank or a longer window, or longer runs",
             )
-        grams = Held(stack, moved) if size <= window else Band(stack, window + ahead, moved)
-        return cls(
-            trajectory=trajectory,
-            rank=rank,
-            kind=kind,
-            window=window,
-            ahead=ahead,
-            _length=length,
-            _grams=grams,
-        )
+        grams = Held(snapshots) if size <= window else Band(snapshots, window + ahead)
+        return cls(rank=rank, window=window, ahead=ahead, _snapshots=snapshots, _grams=grams)
 
     def tokens(self, t: int) -> PrefixTokens:
-        """Coefficients around a start, without its basis; the run is not read again.
+        """Return the coefficients around a start; the run is not read again.
 
         Raises:
             RepresentationError: there is no such snapshot, too few came before it, or they lie
                 along fewer directions than the rank.
         """
-        first, where = self._first(t), Stack([self.trajectory]).where
-        squares, images = self._grams.solve(first, t, min(t + self.ahead, self._length - 1))
+        self._check_start(t)
+        first, last = max(0, t - self.window + 1), self._snapshots.shape[0] - 1
+        squares, images = self._grams.solve(first, t, min(t + self.ahead, last))
         # Squares below this share of the first are rounding.
         tolerance = float(np.sqrt(len(squares) * np.finfo(np.float64).eps))
-        values = np.sqrt(np.maximum(squares, 0))
-        check_rank(values, self.rank, tolerance, f"snapshots {first} to {t} of {where or 'a run'}")
+        values, where = np.sqrt(np.maximum(squares, 0)), self._snapshots.where or "a run"
+        check_rank(values, self.rank, tolerance, f"snapshots {first} to {t} of {where}")
         values, count = values[: self.rank], t - first + 1
         coefficients = images[:, : self.rank] / values
         return PrefixTokens(
             first=first,
-            coefficients=coefficients * signs_of(coefficients[: max(1, count // 10)]),
+            coefficients=coefficients * signs_of(coefficients[:count]),
             singular_values=values,
             total_energy=float(squares.sum()),
         )
 
     def basis(self, t: int) -> TemporalSVD:
-        """The basis of a start; reads the snapshots that it has seen.
+        """Return the basis of a start; reads the snapshots that it has seen.
 
-        A forecast u is decoded as ``phi_t + basis.inverse_transform(u)``, or, of snapshots,
-        without phi_t.
+        A forecast u is decoded as ``phi_t + basis.inverse_transform(u)``.
 
         Raises:
             RepresentationError: as ``tokens``.
         """
         tokens = self.tokens(t)
-        rows = matrix_of(self.trajectory)[tokens.first : t + 1]
+        rows = self._snapshots.rows[tokens.first : t + 1]
         mix = tokens.coefficients[: len(rows)].T / tokens.singular_values[:, None]
         components = np.empty((self.rank, rows.shape[1]))
         for span in spans(rows.shape[1]):
             block = np.asarray(rows[:, span], np.float64)
-            components[:, span] = mix @ (block - block[-1] if self._moved else block)
+            components[:, span] = mix @ (block - block[-1])
         return TemporalSVD(
             components=components,
             singular_values=tokens.singular_values,
             total_energy=tokens.total_energy,
         )
 
-    @property
-    def _moved(self) -> bool:
-        return self.kind == "displacements"
-
-    def _first(self, t: int) -> int:
-        if not 0 <= t < self._length:
+    def _check_start(self, t: int) -> None:
+        where, last = self._snapshots.where, self._snapshots.shape[0] - 1
+        if not 0 <= t <= last:
             raise RepresentationError(
                 "there is no such start",
-                expected=f"a snapshot from 0 to {self._length - 1}",
+                expected=f"a snapshot from 0 to {last}",
                 got=t,
-                where=Stack([self.trajectory]).where,
+                where=where,
             )
-        needed = self.rank - 1 + self._moved
-        if t < needed:
+        if t < self.rank:
             raise RepresentationError(
                 "there are too few snapshots up to this start",
-                expected=f"a start from {needed}, for {self.rank} directions of {self.kind}",
+                expected=f"a start from {self.rank}, for {self.rank} directions of displacements",
                 got=t,
-                where=Stack([self.trajectory]).where,
+                where=where,
                 do="choose later starts, or a smaller rank",
             )
-        return max(0, t - self.window + 1)

@@ -1,10 +1,10 @@
 """The leading singular vectors of a matrix that is read a few times, a piece at a time.
 
 Randomised subspace iteration (Halko, Martinsson and Tropp, "Finding structure with randomness",
-SIAM Review 2011, algorithm 4.4) with two changes. A pass over the rows of A takes ``V`` to both
-``A V`` and ``A^T (A V)``, so that each power iteration reads the matrix once. And the directions
-of all passes are kept, not those of the last alone (block Krylov; Musco and Musco, NeurIPS 2015):
-what has been computed anyhow then makes the error smaller by orders of magnitude.
+SIAM Review 2011, algorithm 4.4) with two changes. One pass over the rows of A computes both ``A V``
+and ``A^T (A V)``, so that each power iteration reads the matrix once. And the directions of all
+passes are kept, not only the last ones (block Krylov; Musco and Musco, NeurIPS 2015), which makes
+the error smaller by orders of magnitude at no cost.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tipl.representation.rows import Stack, spans
+from tipl.representation.rows import Snapshots, spans
 
 NEW = 1e-3
-"""Squared length of what a unit vector adds to a basis, below which it adds nothing but rounding.
-Directions are made orthogonal to the earlier ones, so that most add all their length."""
+"""Squared length of what a unit vector adds to a basis; below this it adds only rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,26 +36,18 @@ class Leading:
 
 
 def leading(
-    stack: Stack, rank: int, *, oversampling: int, power_iterations: int, seed: int
+    snapshots: Snapshots, rank: int, *, oversampling: int, power_iterations: int, seed: int
 ) -> Leading:
-    """The leading singular triplets; reads the matrix ``power_iterations + 1`` times.
+    """Return the leading singular triplets; read the matrix ``power_iterations + 1`` times.
 
-    All arithmetic is in float64. In float32, the first singular value of weights, hundreds of times
-    the others, would drown them in the first pass.
-
-    Args:
-        stack: the matrix.
-        rank: singular triplets.
-        oversampling: directions beyond the rank that are followed.
-        power_iterations: passes before the last one.
-        seed: seed of the random directions at the start.
+    All arithmetic is in float64: the first singular value of weights is hundreds of times the
+    others, which float32 would lose in the first pass.
     """
-    width = min(rank + oversampling, stack.shape[1])
-    start = np.random.default_rng(seed).standard_normal((stack.shape[1], width))
-    directions = _orthonormal(start)
-    basis, images, energy = [directions], [], 0.0
+    width = min(rank + oversampling, snapshots.shape[1])
+    start = np.random.default_rng(seed).standard_normal((snapshots.shape[1], width))
+    basis, images, energy = [_orthonormal(start)], [], 0.0
     for i in range(power_iterations + 1):
-        image, back, found = _pass(stack, basis[-1], first=i == 0, last=i == power_iterations)
+        image, back, found = _pass(snapshots, basis[-1], first=i == 0, last=i == power_iterations)
         images.append(image)
         energy += found
         if back is None:
@@ -70,15 +61,15 @@ def leading(
 
 
 def _pass(
-    stack: Stack, directions: Float[np.ndarray, "param width"], *, first: bool, last: bool
+    snapshots: Snapshots, directions: Float[np.ndarray, "param width"], *, first: bool, last: bool
 ) -> tuple[Float[np.ndarray, "time width"], Float[np.ndarray, "param width"] | None, float]:
-    """A V, A^T A V but in the last pass, and the squared norm of A in the first."""
-    image = np.empty((stack.shape[0], directions.shape[1]))
+    """Return A V; A^T A V unless it is the last pass; the squared norm of A if it is the first."""
+    image = np.empty((snapshots.shape[0], directions.shape[1]))
     back = None if last else np.zeros(directions.shape)
     energy = 0.0
-    for start, rows in stack.pieces():
+    for start, rows in snapshots.pieces():
         if first:
-            energy += squared_norm(rows)
+            energy += _squared_norm(rows)
         product = image[start : start + len(rows)]
         product[:] = 0
         for span in spans(rows.shape[1]):
@@ -95,8 +86,8 @@ def _of_basis(
     rank: int,
     energy: float,
 ) -> Leading:
-    """The best triplets that a basis V has (Rayleigh-Ritz), from A V."""
-    # V is orthonormal but for rounding. Its Gram matrix tells how much, and takes that out.
+    """Return the best triplets within a basis V (Rayleigh-Ritz), from A V."""
+    # V is orthonormal except for rounding, which its Gram matrix takes out.
     gram = np.zeros((images.shape[1],) * 2)
     for part in _blocks(basis):
         gram += part.T @ part
@@ -116,7 +107,7 @@ def _of_basis(
 def _subtract(
     vectors: Float[np.ndarray, "param width"], basis: Sequence[Float[np.ndarray, "param _"]]
 ) -> None:
-    """Take out of vectors, in place, what lies in an orthonormal basis."""
+    """Subtract from vectors, in place, their part in an orthonormal basis."""
     size = len(vectors)
     overlap = np.zeros((sum(part.shape[1] for part in basis), vectors.shape[1]))
     for span, part in zip(spans(size), _blocks(basis), strict=True):
@@ -126,11 +117,11 @@ def _subtract(
 
 
 def _orthonormal(vectors: Float[np.ndarray, "param width"]) -> Float[np.ndarray, "param kept"]:
-    """An orthonormal basis of the span, in the place of the vectors; all but rounding is kept.
+    """Return an orthonormal basis of the span, in the memory of the vectors.
 
-    From Gram matrices, which is cheaper than QR by far. But a Gram matrix tells only lengths apart
-    that are within 1e8 of each other. So the longest directions are found first, and then, in what
-    they leave, the longest again.
+    It comes from Gram matrices, which are far cheaper than QR. A Gram matrix only resolves lengths
+    within 1e8 of each other. So the longest directions are found first, then the longest ones of
+    the rest, until only rounding is left.
     """
     lengths = np.sqrt(np.einsum("pw,pw->w", vectors, vectors))
     vectors /= np.where(lengths > 0, lengths, 1)
@@ -149,13 +140,13 @@ def _orthonormal(vectors: Float[np.ndarray, "param width"]) -> Float[np.ndarray,
     return vectors[:, left:]
 
 
-def squared_norm(rows: Float[np.ndarray, "row param"]) -> float:
-    """Squared Frobenius norm, summed in float64."""
+def _squared_norm(rows: Float[np.ndarray, "row param"]) -> float:
+    """Return the squared Frobenius norm, summed in float64."""
     wide = (row.astype(np.float64) for row in rows)
     return float(sum(row @ row for row in wide))
 
 
 def _blocks(basis: Sequence[np.ndarray]) -> Iterator[Float[np.ndarray, "block all"]]:
-    """Some parameters of all directions at a time."""
+    """Yield some parameters of all directions at a time."""
     for span in spans(len(basis[0])):
         yield np.concatenate([part[span] for part in basis], axis=1)

@@ -1,8 +1,8 @@
-"""Snapshots of one or several trajectories, a piece at a time: no run need fit into memory."""
+"""The weights of one trajectory, read a piece at a time, so that no run need fit into memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,134 +13,69 @@ from tipl.runs import Rows, weights_of
 from weighttraj import Run
 
 PIECE_BYTES = 64 << 20
-"""Bytes of the rows that are in memory at a time, at most, where a block of a run is smaller."""
-
-
+"""Bytes of the rows that are read at once."""
 BLOCK = 4096
-"""Parameters that are in memory as float64 at a time."""
+"""Number of parameters that are converted to float64 at once."""
 
 RunOrRows = Run | Rows
 """The snapshots of one run, time-ordered: the run, or the matrix of its weights."""
 
 
-def matrix_of(trajectory: RunOrRows) -> Rows:
-    """Return the matrix of a run's weights."""
-    return weights_of(trajectory) if isinstance(trajectory, Run) else trajectory
-
-
 def spans(size: int) -> Iterator[slice]:
-    """Some parameters at a time."""
+    """Yield slices of at most ``BLOCK`` parameters."""
     return (slice(start, start + BLOCK) for start in range(0, size, BLOCK))
 
 
-class Stack:
-    """Trajectories one below the other, as one matrix.
+class Snapshots:
+    """The weights of a trajectory as a matrix (time, param) that is read in pieces.
 
     Args:
-        trajectories: of equally many parameters.
-        piece: rows that are read at once; None: about ``PIECE_BYTES``, and whole chunks of a run.
+        trajectory: the run, or the matrix of its weights.
+        piece: number of rows that are read at once; None: about ``PIECE_BYTES``.
 
     Raises:
-        RepresentationError: there are no trajectories or no snapshots, or they do not fit
-            together.
+        RepresentationError: there is no snapshot or no parameter, or the matrix has other axes.
     """
 
-    def __init__(self, trajectories: Sequence[RunOrRows], piece: int | None = None) -> None:
-        self._parts = [matrix_of(t) for t in trajectories]
-        self._places = [t.path if isinstance(t, Run) else None for t in trajectories]
-        blocks = [t.info.block if isinstance(t, Run) else 1 for t in trajectories]
-        shapes = [part.shape for part in self._parts]
-        if len({shape[1:] for shape in shapes}) != 1 or len(shapes[0]) != 2:
-            raise RepresentationError(
-                "these are no trajectories of one kind of policy",
-                expected="matrices (time, param) with equally many parameters",
-                got=f"shapes {shapes}",
-                do="give runs of one data set",
-            )
-        self.lengths = [shape[0] for shape in shapes]
-        """Snapshots of each trajectory."""
-        self.shape = (sum(self.lengths), shapes[0][1])
-        """Snapshots of all, and parameters."""
-        if 0 in self.shape:
+    def __init__(self, trajectory: RunOrRows, piece: int | None = None) -> None:
+        self.rows: Rows = weights_of(trajectory) if isinstance(trajectory, Run) else trajectory
+        self.where = trajectory.path if isinstance(trajectory, Run) else None
+        self.shape = self.rows.shape
+        if len(self.shape) != 2 or 0 in self.shape:
             raise RepresentationError(
                 "there is nothing to represent",
-                expected="a snapshot and a parameter at least",
-                got=f"shapes {shapes}",
+                expected="a matrix (time, param) with a snapshot and a parameter at least",
+                got=f"shape {self.shape}",
                 where=self.where,
                 do="wait until the run has committed its first snapshots",
             )
-        single = all(part.dtype == np.float32 for part in self._parts)
+        single = self.rows.dtype == np.float32
         self.dtype: np.dtype[Any] = np.dtype(np.float32 if single else np.float64)
-        """float32 where all weights are; else float64."""
-        self._steps = [
-            piece or _step(self.shape[1] * part.dtype.itemsize, block)
-            for part, block in zip(self._parts, blocks, strict=True)
-        ]
-
-    @property
-    def where(self) -> str | None:
-        """Where the runs lie; None: they are arrays."""
-        return ", ".join(str(place) for place in self._places if place) or None
+        self._piece = piece or max(1, PIECE_BYTES // (self.shape[1] * self.rows.dtype.itemsize))
 
     def pieces(self) -> Iterator[tuple[int, Float[np.ndarray, "row param"]]]:
-        """Yield each piece, and the number of its first row in the stack.
+        """Yield each piece with the number of its first row.
 
         Raises:
             RepresentationError: a value is not finite.
-            DamageError: a run is damaged.
+            DamageError: the run is damaged.
         """
-        first = 0
-        for part, place, n, step in zip(
-            self._parts, self._places, self.lengths, self._steps, strict=True
-        ):
-            for start in range(0, n, step):
-                rows = np.asarray(part[start : start + step], self.dtype)
-                check_finite(rows, start, place)
-                yield first + start, rows
-            first += n
+        for start in range(0, self.shape[0], self._piece):
+            rows = np.asarray(self.rows[start : start + self._piece], self.dtype)
+            self._check_finite(rows, start)
+            yield start, rows
 
     def read(self) -> Float[np.ndarray, "time param"]:
-        """All rows, in memory."""
-        out = np.empty(self.shape, self.dtype)
-        for start, rows in self.pieces():
-            out[start : start + len(rows)] = rows
-        return out
+        """Return all rows, in float64."""
+        return np.concatenate([rows.astype(np.float64) for _, rows in self.pieces()])
 
-    def early(self) -> np.ndarray:
-        """Numbers of the rows in the first tenth of each trajectory: they settle signs."""
-        ends = np.cumsum(self.lengths)
-        tenths = [np.arange(max(1, n // 10)) for n in self.lengths]
-        return np.concatenate(
-            [end - n + rows for end, n, rows in zip(ends, self.lengths, tenths, strict=True)]
-        )
-
-
-def check_finite(
-    rows: Float[np.ndarray, "row param"], first: int = 0, where: object = None
-) -> None:
-    """Refuse weights that are NaN or infinite.
-
-    Args:
-        rows: some snapshots.
-        first: number of the first of them.
-        where: what they are of.
-
-    Raises:
-        RepresentationError: a value is not finite.
-    """
-    if not np.isfinite(rows).all():
-        bad = first + int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
-        raise RepresentationError(
-            "the weights are not finite",
-            expected="numbers only",
-            got=f"NaN or infinity in snapshot {bad}",
-            where=where,
-            do="leave the run out; `weighttraj verify` names it",
-        )
-
-
-def _step(row_bytes: int, block: int) -> int:
-    """Rows of a piece. Of a run, a power of two of blocks: wide packed runs have 64 or 128 rows
-    in a chunk."""
-    blocks = max(1, PIECE_BYTES // max(1, row_bytes * block))
-    return block << (blocks.bit_length() - 1)
+    def _check_finite(self, rows: Float[np.ndarray, "row param"], first: int) -> None:
+        bad = ~np.isfinite(rows).all(axis=1)
+        if bad.any():
+            raise RepresentationError(
+                "the weights are not finite",
+                expected="numbers only",
+                got=f"NaN or infinity in snapshot {first + int(bad.argmax())}",
+                where=self.where,
+                do="leave the run out; `weighttraj verify` names it",
+            )

@@ -7,19 +7,20 @@ of U, cut to the first d columns.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
 
 from tipl.errors import RepresentationError
 from tipl.representation.randomised import leading
-from tipl.representation.rows import RunOrRows, Stack
+from tipl.representation.rows import RunOrRows, Snapshots
+from weighttraj import Run
 
 EXACT_WORK = 10**9
-"""Smaller side squared times larger side, up to which ``fit_run`` and ``fit_shared`` take the
-exact SVD: about a second of one core. 122 parameters and 1,951 snapshots are 3 % of it."""
+"""Smaller side squared times larger side, up to which ``fit_run`` takes the exact SVD: about a
+second of one core. 122 parameters and 1,951 snapshots are 3 % of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,16 +43,16 @@ class TemporalSVD:
 
     @classmethod
     def fit(cls, weights: Float[np.ndarray, "time param"], rank: int) -> TemporalSVD:
-        """Basis of a trajectory in memory, exact, in float64.
+        """Return the exact basis of a trajectory in memory, computed in float64.
 
-        Signs are arbitrary in an SVD. Here each column of U has a positive sum over the first
+        The signs of an SVD are arbitrary. Here each column of U has a positive sum over the first
         tenth of the run, so that columns of different runs are alike.
 
         Raises:
             RepresentationError: the rank is not between 1 and the smaller side or is above the
                 rank of the weights, or they are not finite.
         """
-        return _exact(Stack([weights]), rank)
+        return _exact(Snapshots(weights), rank)
 
     @classmethod
     def fit_streamed(
@@ -64,26 +65,25 @@ class TemporalSVD:
         seed: int = 0,
         piece: int | None = None,
     ) -> TemporalSVD:
-        """Basis of a trajectory of any length, by a randomised SVD (Halko et al., 2011).
+        """Return the basis of a trajectory of any length, by a randomised SVD (Halko et al., 2011).
 
-        Reads (and decodes) the run ``power_iterations + 1`` times, a piece at a time. With w =
-        rank + oversampling, it takes ``(4 * power_iterations + 2) * w * T * P`` operations, where
+        Reads the run ``power_iterations + 1`` times, a piece at a time. With w = rank +
+        oversampling, it takes ``(4 * power_iterations + 2) * w * T * P`` operations, where
         an exact SVD takes ``4 * T * T * P`` and more, and keeps ``(power_iterations + 3) * w * P``
         float64 in memory beside a piece.
 
         The leading singular values are the most accurate. On random walks and on a run of PPO on
         HalfCheetah, with the defaults: the first 32 of 64 within 1e-5, the last within 2e-3; with
-        one power iteration more within 1e-9 and 3e-6. They are never too large, but for rounding.
-        The same seed and pieces give the same basis, bit by bit; other pieces, the same up to
-        rounding. Signs are as in ``fit``.
+        one power iteration more within 1e-9 and 3e-6. Apart from rounding they are never too
+        large. The same seed and pieces give the same bits. Signs are as in ``fit``.
 
         Args:
             trajectory: the run, or a matrix that is read when it is sliced.
-            rank: directions d.
-            oversampling: directions beyond the rank that are followed on the way.
-            power_iterations: passes before the last one.
+            rank: number of directions d.
+            oversampling: number of directions beyond the rank that are followed.
+            power_iterations: number of passes before the last one.
             seed: seed of the random directions at the start.
-            piece: snapshots that are in memory at a time; None: about 64 MiB, or a chunk.
+            piece: number of snapshots in memory at once; None: about 64 MiB.
 
         Raises:
             RepresentationError: as ``fit``, or a setting is negative.
@@ -96,8 +96,8 @@ class TemporalSVD:
                 got=(oversampling, power_iterations, seed, piece),
                 do="leave them out: the defaults suit runs of PPO",
             )
-        stack = Stack([trajectory], piece)
-        return _streamed(stack, rank, oversampling, power_iterations, seed)
+        snapshots = Snapshots(trajectory, piece)
+        return _streamed(snapshots, rank, oversampling, power_iterations, seed)
 
     @property
     def rank(self) -> int:
@@ -107,18 +107,18 @@ class TemporalSVD:
     def transform(
         self, weights: Float[np.ndarray, "*batch param"]
     ) -> Float[np.ndarray, "*batch rank"]:
-        """Coefficients u = phi V / S: rows of U for the weights of the fit."""
+        """Return the coefficients u = phi V / S: rows of U for the weights of the fit."""
         return np.asarray(weights @ self.components.T / self.singular_values)
 
     def inverse_transform(
         self, coefficients: Float[np.ndarray, "*batch rank"]
     ) -> Float[np.ndarray, "*batch param"]:
-        """Weights phi~ = u S V^T."""
+        """Return the weights phi~ = u S V^T."""
         return np.asarray((coefficients * self.singular_values) @ self.components)
 
     def coefficients(self, trajectory: RunOrRows) -> Float[np.ndarray, "time rank"]:
-        """Coefficients of a whole trajectory, read a piece at a time."""
-        pieces = Stack([trajectory]).pieces()
+        """Return the coefficients of a whole trajectory, which is read a piece at a time."""
+        pieces = Snapshots(trajectory).pieces()
         return np.concatenate([self.transform(rows) for _, rows in pieces])
 
     @property
@@ -127,78 +127,85 @@ class TemporalSVD:
         return np.cumsum(self.singular_values**2) / self.total_energy
 
     def reconstruction_error(self, trajectory: RunOrRows) -> float:
-        """Mean squared error of the weights after a round trip through d coefficients.
-
-        In squared units of a weight; read a piece at a time.
-        """
-        stack = Stack([trajectory])
-        total = 0.0
-        for _, rows in stack.pieces():
-            back = self.inverse_transform(self.transform(rows))
-            back -= rows
-            total += float(np.vdot(back, back))
-        return total / (stack.shape[0] * stack.shape[1])
+        """Return the mean squared error of the weights that d coefficients give back."""
+        snapshots, total = Snapshots(trajectory), 0.0
+        for _, rows in snapshots.pieces():
+            error = self.inverse_transform(self.transform(rows)) - rows
+            total += float(np.vdot(error, error))
+        return total / (snapshots.shape[0] * snapshots.shape[1])
 
 
-def fit_run(trajectory: RunOrRows, rank: int, *, seed: int = 0) -> TemporalSVD:
-    """Basis of a run: exact up to ``EXACT_WORK``, else streamed with the defaults.
+@dataclass(frozen=True, kw_only=True)
+class Embedded:
+    """A run in the basis of its whole trajectory."""
+
+    svd: TemporalSVD
+    """The basis."""
+    coefficients: Float[np.ndarray, "time rank"]
+    """Row t stands for phi_t."""
+
+
+def embed(run: Run, rank: int) -> Embedded:
+    """Return a run in d coefficients, as the paper represents it.
+
+    The basis of a large run takes tens of seconds and forecasts are asked for some starts at a
+    time, so the result is kept as long as the run is open.
 
     Raises:
         RepresentationError: as ``TemporalSVD.fit``.
     """
-    return fit_shared([trajectory], rank, seed=seed)
+    known = _EMBEDDED.setdefault(run, {})
+    if rank not in known:
+        svd = fit_run(run, rank)
+        known[rank] = Embedded(svd=svd, coefficients=svd.coefficients(run))
+    return known[rank]
 
 
-def fit_shared(trajectories: Sequence[RunOrRows], rank: int, *, seed: int = 0) -> TemporalSVD:
-    """One basis for several runs: of their snapshots one below the other.
+_EMBEDDED: WeakKeyDictionary[Run, dict[int, Embedded]] = WeakKeyDictionary()
 
-    Expect it to fail on other runs. Each run begins at its own initialisation and goes its own
-    way, so that the directions of some runs hold hardly more of another's movement than random
-    ones. It is here to show that, and for runs that do share a beginning.
 
-    Signs are settled by the first tenth of every run; ``transform`` scales all runs alike.
+def fit_run(trajectory: RunOrRows, rank: int, *, seed: int = 0) -> TemporalSVD:
+    """Return the basis of a run: exact up to ``EXACT_WORK``, else streamed with the defaults.
 
     Raises:
-        RepresentationError: as ``TemporalSVD.fit``, or the runs have different policies.
+        RepresentationError: as ``TemporalSVD.fit``.
     """
-    stack = Stack(trajectories)
-    small, large = sorted(stack.shape)
+    snapshots = Snapshots(trajectory)
+    small, large = sorted(snapshots.shape)
     if small**2 * large <= EXACT_WORK:
-        return _exact(stack, rank)
-    return _streamed(stack, rank, oversampling=32, power_iterations=2, seed=seed)
+        return _exact(snapshots, rank)
+    return _streamed(snapshots, rank, oversampling=32, power_iterations=2, seed=seed)
 
 
-def _exact(stack: Stack, rank: int) -> TemporalSVD:
-    _check_sides(stack, rank)
-    weights = stack.read().astype(np.float64)
-    left, values, right = np.linalg.svd(weights, full_matrices=False)
-    check_rank(values, rank, _rounding(stack), stack.where)
-    signs = signs_of(left[stack.early(), :rank])
+def _exact(snapshots: Snapshots, rank: int) -> TemporalSVD:
+    _check_sides(snapshots, rank)
+    left, values, right = np.linalg.svd(snapshots.read(), full_matrices=False)
+    check_rank(values, rank, _rounding(snapshots), snapshots.where)
     return TemporalSVD(
-        components=right[:rank] * signs[:, None],
+        components=right[:rank] * signs_of(left[:, :rank])[:, None],
         singular_values=values[:rank],
         total_energy=float(np.sum(values**2)),
     )
 
 
 def _streamed(
-    stack: Stack, rank: int, oversampling: int, power_iterations: int, seed: int
+    snapshots: Snapshots, rank: int, oversampling: int, power_iterations: int, seed: int
 ) -> TemporalSVD:
-    _check_sides(stack, rank)
+    _check_sides(snapshots, rank)
     found = leading(
-        stack, rank, oversampling=oversampling, power_iterations=power_iterations, seed=seed
+        snapshots, rank, oversampling=oversampling, power_iterations=power_iterations, seed=seed
     )
-    check_rank(found.singular_values, rank, _rounding(stack), stack.where)
-    signs = signs_of(found.left[stack.early()])
+    check_rank(found.singular_values, rank, _rounding(snapshots), snapshots.where)
     return TemporalSVD(
-        components=found.components * signs[:, None],
+        components=found.components * signs_of(found.left)[:, None],
         singular_values=found.singular_values,
         total_energy=found.energy,
     )
 
 
-def signs_of(early: Float[np.ndarray, "row rank"]) -> Float[np.ndarray, " rank"]:
-    """1 or -1 for each column of U, so that its sum over these rows is positive."""
+def signs_of(left: Float[np.ndarray, "time rank"]) -> Float[np.ndarray, " rank"]:
+    """Return 1 or -1 for each column of U: times it, the first tenth of the column sums above 0."""
+    early = left[: max(1, len(left) // 10)]
     return np.where(early.sum(0) < 0, -1.0, 1.0)
 
 
@@ -208,13 +215,10 @@ def check_rank(
     """Refuse directions along which the weights do not move: their coefficients would be noise.
 
     Args:
-        values: singular values, falling, as many as the rank or more.
-        rank: directions asked for.
+        values: singular values, falling, at least as many as the rank.
+        rank: number of directions that were asked for.
         tolerance: share of the first singular value that may be rounding.
-        where: what the weights are of.
-
-    Raises:
-        RepresentationError: the weights have a lower rank.
+        where: what the weights belong to.
     """
     moving = int(np.sum(values > tolerance * values[0]))
     if rank > moving:
@@ -227,17 +231,17 @@ def check_rank(
         )
 
 
-def _rounding(stack: Stack) -> float:
-    """Share of the first singular value that is rounding in float64; numpy's rule for ranks."""
-    return max(stack.shape) * float(np.finfo(np.float64).eps)
+def _rounding(snapshots: Snapshots) -> float:
+    """Return the share of the first singular value that is rounding: numpy's rule for ranks."""
+    return max(snapshots.shape) * float(np.finfo(np.float64).eps)
 
 
-def _check_sides(stack: Stack, rank: int) -> None:
-    if not 1 <= rank <= min(stack.shape):
+def _check_sides(snapshots: Snapshots, rank: int) -> None:
+    if not 1 <= rank <= min(snapshots.shape):
         raise RepresentationError(
             "the rank does not fit the weights",
-            expected=f"1 to {min(stack.shape)}, the smaller side of {stack.shape}",
+            expected=f"1 to {min(snapshots.shape)}, the smaller side of {snapshots.shape}",
             got=rank,
-            where=stack.where,
+            where=snapshots.where,
             do="choose a smaller rank, or longer runs",
         )
