@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -13,18 +14,21 @@ import pytest
 import torch
 from gymnasium import spaces
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.dqn.policies import DQNPolicy
+from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 from torch.nn.utils import parametrizations, parametrize
 
 import weighttraj as wt
 from weighttraj.collect import WeightTrajectoryCallback
-from weighttraj.collect.agents import actor_parameters
-from weighttraj.collect.describe import describe_policy
+from weighttraj.collect.agents import actor_parameters, find_agent
+from weighttraj.collect.describe import describe_agent, describe_policy
 from weighttraj.errors import PolicyError
 
 
@@ -158,6 +162,63 @@ class Boxed(gym.Env[Any, Any]):
 
 
 CONTINUOUS = spaces.Box(-1, 1, (2,))
+
+
+class Rare(ActorCriticPolicy):
+    """Acts otherwise for one observation in a thousand."""
+
+    def extract_features(self, obs: Any, *args: Any, **kwargs: Any) -> Any:
+        rare = (obs[:, :1] > 0.3) & (obs[:, :1] < 0.301)
+        return super().extract_features(torch.where(rare, 0 * obs, obs), *args, **kwargs)
+
+
+class Asks(FlattenExtractor):
+    """Branches in Python on what it sees."""
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        features = super().forward(observations)
+        return features if float(features.sum()) != 1.25 else -features
+
+
+class AsksByNumPy(FlattenExtractor):
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        features = super().forward(observations)
+        return features if features.numpy().max() < 1e6 else -features
+
+
+class ChangesInPlace(FlattenExtractor):
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        features = super().forward(observations)
+        features[:, 0].clamp_(-1e6, 1e6)
+        return features
+
+
+class RareAction(ActorCriticPolicy):
+    def _predict(self, observation: Any, deterministic: bool = False) -> Any:
+        return super()._predict(observation, deterministic).clamp(-1e6, 1e6)
+
+
+class RarePrediction(ActorCriticPolicy):
+    """Another action for one observation in a thousand, chosen among arrays."""
+
+    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> Any:
+        actions, state = super().predict(observation, *args, **kwargs)
+        return actions * np.where(
+            0.3 < actions < 0.301, 2, 1
+        ) if actions.size == 1 else actions, state
+
+
+class Watches(ActorCriticPolicy):
+    """Looks at its own actions, and changes none."""
+
+    largest = torch.zeros(())
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Any:
+        actions = super()._predict(observation, deterministic)
+        self.largest = torch.maximum(self.largest, actions.abs().max())
+        return actions
+
+
 OTHERS: dict[str, tuple[Callable[[], Any], str]] = {
     "residual": (lambda: policy_of(Residual), "mean of the action distribution differ"),
     "residual at zero": (lambda: policy_of(ZeroResidual), "differ.*with random weights"),
@@ -175,6 +236,25 @@ OTHERS: dict[str, tuple[Callable[[], Any], str]] = {
     "an extractor that clamps": (
         lambda: policy_of(features_extractor_class=ClampsFar),
         "mean of the action distribution differ",
+    ),
+    "a branch for rare observations": (lambda: policy_of(Rare), "may act otherwise.*gt"),
+    "a branch for rare actions": (lambda: policy_of(RareAction), "may act otherwise.*clamp"),
+    "a branch among arrays": (lambda: policy_of(RarePrediction), "a `predict` of its own"),
+    "a branch in Python": (
+        lambda: policy_of(features_extractor_class=Asks),
+        r"may act otherwise.*\(read by Python\)",
+    ),
+    "a branch by NumPy": (
+        lambda: policy_of(features_extractor_class=AsksByNumPy),
+        r"may act otherwise.*numpy \(read by Python\)",
+    ),
+    "a change in place": (
+        lambda: policy_of(features_extractor_class=ChangesInPlace),
+        "may act otherwise.*clamp_",
+    ),
+    "a predict of one instance": (
+        lambda: changed(lambda p: setattr(p, "predict", functools.partial(p.predict))),
+        "a `predict` of its own",
     ),
     "a layer that halves": (lambda: changed(halve), "mean of the action distribution differ"),
     "tied layers": (lambda: changed(tie), "shared.*policy_net.4.bias"),
@@ -265,10 +345,14 @@ PLAIN: dict[str, Callable[[], Any]] = {
     "a subclass of Linear": lambda: changed(make_same),
     "two extractors": lambda: policy_of(share_features_extractor=False),
     "no hidden layer": lambda: policy_of(net_arch=[]),
+    "a policy that looks at its actions": lambda: policy_of(Watches),
     "elu": lambda: policy_of(activation_fn=nn.ELU),
     "leaky_relu": lambda: policy_of(activation_fn=nn.LeakyReLU, env="CartPole-v1"),
     "observations of integers": lambda: policy_of(
         env=Boxed(spaces.Box(-5, 5, (3,), np.int64), spaces.Discrete(4))
+    ),
+    "observations of bytes": lambda: policy_of(
+        env=Boxed(spaces.Box(0, 255, (5,), np.uint8), spaces.Discrete(3))
     ),
     "observations of two dimensions": lambda: policy_of(
         env=Boxed(spaces.Box(-1, 1, (2, 3), np.float64), spaces.Box(-1, 1, (2, 2)))
@@ -340,7 +424,9 @@ class Later(ActorCriticPolicy):
     gain = 1.0
 
     def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Any:
-        return super()._get_action_dist_from_latent(latent_pi * self.gain)
+        return super()._get_action_dist_from_latent(
+            latent_pi if self.gain == 1 else latent_pi * self.gain
+        )
 
 
 class RaisesTheGain(BaseCallback):
@@ -359,6 +445,55 @@ def test_a_policy_that_acts_otherwise_at_the_end_is_found_there(tmp_path: Path) 
     assert wt.verify(run.path) == []
     with pytest.raises(PolicyError, match="acts otherwise than the agent"):
         run.load_policy(0)
+
+
+class HalfModel(PPO):
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        actions, state = super().predict(*args, **kwargs)
+        return actions / 2, state
+
+
+class HalfSAC(SACPolicy):
+    """Its actor is a plain one, its own actions are not."""
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Any:
+        return super()._predict(observation, deterministic) / 2
+
+
+class RareActor(Actor):
+    def forward(self, obs: torch.Tensor, deterministic: bool = False) -> torch.Tensor:
+        return super().forward(obs.clamp(-1e6, 1e6), deterministic)
+
+
+class RareSAC(SACPolicy):
+    def make_actor(self, features_extractor: Any = None) -> Any:
+        return RareActor(**self._update_features_extractor(self.actor_kwargs, features_extractor))
+
+
+class LowestQ(DQNPolicy):
+    def _predict(self, obs: Any, deterministic: bool = True) -> Any:
+        return self.q_net(obs).argmin(dim=1).reshape(-1)
+
+
+WHOLE: dict[str, tuple[Callable[[], BaseAlgorithm], str]] = {
+    "a model that predicts otherwise": (
+        lambda: HalfModel("MlpPolicy", "Pendulum-v1", n_steps=16, batch_size=16, n_epochs=1),
+        "a `predict` of its own, HalfModel.predict",
+    ),
+    "a policy around a plain actor": (lambda: SAC(HalfSAC, "Pendulum-v1"), "acts otherwise"),
+    "an actor with a rare branch": (lambda: SAC(RareSAC, "Pendulum-v1"), "otherwise.*clamp"),
+    "another choice by the same network": (
+        lambda: DQN(LowestQ, "CartPole-v1"),
+        "acts otherwise",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_the_whole_model_is_compared_and_not_its_network_alone(name: str) -> None:
+    make, reason = WHOLE[name]
+    with pytest.raises(AssertionError, match=reason):
+        raise AssertionError("; ".join(describe_agent(find_agent(make()), ()).cannot_rebuild))
 
 
 def test_training_is_the_same_with_the_comparison_and_without() -> None:

@@ -6,6 +6,7 @@ import importlib.metadata
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,7 +25,7 @@ from torch import nn
 from weighttraj.collect.agents import Agent, actor_parameters
 from weighttraj.collect.environment import describe_env
 from weighttraj.collect.normalizers import Normalizers
-from weighttraj.collect.proof import find_difference
+from weighttraj.collect.proof import find_difference, own_methods
 from weighttraj.format import Algorithm, Cadence, ParamLayout, PolicySpec, Provenance, RunInfo
 from weighttraj.format.layout import Role
 
@@ -164,12 +165,13 @@ def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> 
 
 def describe_agent(agent: Agent, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
     """Return what it takes to rebuild the network that acts, or the reasons why it cannot be."""
+    own = own_methods(agent.model, ("predict",))
     if isinstance(agent.network, ActorCriticPolicy):
-        return describe_policy(agent.network, unknown_wrappers)
+        return describe_policy(agent.network, unknown_wrappers, own)
     spec, reasons = _off_policy(agent)
     if not reasons:
         layout = describe_layout(agent.actor, spec)
-        reasons = find_difference(agent.network, spec, layout, agent.prefix)
+        reasons = find_difference(agent.model.policy, spec, layout) + own
     if reasons:
         spec = replace(spec, acting="", layers=(), log_std=(), activation="")
     reasons += _changing(unknown_wrappers)
@@ -231,12 +233,20 @@ def _parts(network: Any) -> tuple[Acting, nn.Sequential, str, str, tuple[str, ..
     return None
 
 
-def describe_policy(policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...]) -> PolicySpec:
+def describe_policy(
+    policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...], more: Sequence[str] = ()
+) -> PolicySpec:
     """What it takes to rebuild the policy, or the reasons why it cannot be.
 
     A description without reasons is proven: the policy that is rebuilt from it acts as this one.
+
+    Args:
+        policy: of the agent.
+        unknown_wrappers: those that may change observations or actions.
+        more: reasons that were found elsewhere.
     """
     spec, reasons = _network(policy)
+    reasons = [*reasons, *more]
     if not reasons:
         reasons = find_difference(policy, spec, describe_layout(actor_parameters(policy), spec))
     if reasons:  # what the layers are for is then unknown

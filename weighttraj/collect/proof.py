@@ -2,13 +2,14 @@
 
 A copy of the agent's policy acts, never the agent itself. Equal actions with the present weights
 prove little, as a branch that starts with zero weights does nothing yet, so the copy is also given
-random weights.
+random weights. Equal actions for some observations prove little, as code may treat rare ones in
+another way, so the operations from observations to actions are compared, too: see ``operations``.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from torch import Tensor, nn
 from torch.distributions import Categorical, Normal
 
+from weighttraj.collect.operations import difference, operations
 from weighttraj.collect.undisturbed import undisturbed
 from weighttraj.errors import WeightTrajError
 from weighttraj.format import ParamLayout, PolicySpec
@@ -26,13 +28,15 @@ from weighttraj.policies.policy import Policy
 PolicyT = TypeVar("PolicyT", bound=BasePolicy)
 
 _OBSERVATIONS = 32
+_ON_ARRAYS = ("predict", "obs_to_tensor", "unscale_action")
+"""Methods of a policy that handle arrays: what they do to these cannot be listed."""
+_THEIR_OWN = ("stable_baselines3", "sb3_contrib")
+"""Packages whose methods are compared by their actions alone."""
 _SCALES = (None, 0.1, 1.0)
 """Deviations of the random weights of each comparison; None: the present weights."""
 
 
-def find_difference(
-    policy: BasePolicy, spec: PolicySpec, layout: ParamLayout, prefix: str = ""
-) -> list[str]:
+def find_difference(policy: BasePolicy, spec: PolicySpec, layout: ParamLayout) -> list[str]:
     """Return why a policy acts otherwise than its description says; an empty list if it does not.
 
     Neither the policy nor the global random generators change.
@@ -41,7 +45,6 @@ def find_difference(
         policy: of the agent.
         spec: its description.
         layout: order of the parameters that it acts with.
-        prefix: what their names in the layout have before those in the policy.
     """
     with undisturbed():
         try:
@@ -49,9 +52,27 @@ def find_difference(
         except Exception as error:  # the code of a stranger may raise anything
             return [f"it cannot be copied, and so not be compared with the agent: {_line(error)}"]
         try:
-            return _differences(twin, spec, layout, prefix)
+            return _differences(twin, spec, layout) or own_methods(policy, _ON_ARRAYS)
         except Exception as error:
             return [f"it cannot be compared with the agent: {_line(error)}"]
+
+
+def own_methods(owner: object, names: Sequence[str]) -> list[str]:
+    """Return a reason for each method that is neither Stable-Baselines3's nor its contributors'.
+
+    Args:
+        owner: a policy or a model.
+        names: of its methods.
+    """
+    reasons = []
+    for name in names:
+        method = getattr(owner, name, None)
+        function = getattr(method, "__func__", method)
+        module = str(getattr(function, "__module__", "")).partition(".")[0]
+        if method is not None and module not in _THEIR_OWN:
+            called = getattr(function, "__qualname__", type(function).__name__)
+            reasons.append(f"a `{name}` of its own, {called}, which may act otherwise")
+    return reasons
 
 
 def find_difference_of_network(
@@ -162,15 +183,14 @@ def _computed(value: object, depth: int) -> Iterator[Tensor]:
 
 
 @torch.no_grad()
-def _differences(twin: BasePolicy, spec: PolicySpec, layout: ParamLayout, prefix: str) -> list[str]:
+def _differences(twin: BasePolicy, spec: PolicySpec, layout: ParamLayout) -> list[str]:
     generator = torch.Generator().manual_seed(0)
     observations = _observations(twin.observation_space)
     for scale in _SCALES:
         if scale is not None:
             for parameter in twin.parameters():
                 parameter.normal_(std=scale, generator=generator)
-        named = {f"{prefix}{name}": p for name, p in twin.named_parameters()}
-        rebuilt = _rebuild(spec, layout, named)
+        rebuilt = _rebuild(spec, layout, dict(twin.named_parameters()))
         for training in (False, True):
             twin.set_training_mode(training)
             for what, got, expected in _pairs(twin, rebuilt, observations):
@@ -181,7 +201,55 @@ def _differences(twin: BasePolicy, spec: PolicySpec, layout: ParamLayout, prefix
                         f"the rebuilt policy acts otherwise than the agent: {what} differ by up "
                         f"to {_distance(got, expected)}, with {weights} weights, in {mode} mode"
                     ]
+    return _other_operations(twin, rebuilt, torch.from_numpy(observations))
+
+
+def _other_operations(twin: BasePolicy, rebuilt: Policy, observations: Tensor) -> list[str]:
+    """Return what the agent computes that the rebuilt policy does not, or the other way round."""
+    for training in (False, True):
+        twin.set_training_mode(training)
+        for what, agents, ours in _computations(twin, rebuilt):
+            torch.manual_seed(0)
+            got = operations(agents, observations.clone())
+            expected = operations(ours, observations.clone())
+            if words := difference(got, expected):
+                return [
+                    "its code may act otherwise for other observations than those that were "
+                    f"tried: {what} take {words} than the layers do"
+                ]
     return []
+
+
+_Compute = Callable[[Tensor], Any]
+
+
+def _computations(twin: Any, rebuilt: Policy) -> Iterator[tuple[str, _Compute, _Compute]]:
+    """Yield what is listed: its name, how the agent computes it, how the rebuilt policy does."""
+
+    def act(deterministic: bool) -> _Compute:
+        def compute(observations: Tensor) -> Tensor:
+            actions = rebuilt.choose(observations.float(), deterministic)
+            return actions.tanh() if rebuilt.spec.mode.startswith("squashed") else actions
+
+        return compute
+
+    for deterministic in (True, False):
+        kind = "deterministic" if deterministic else "sampled"
+        yield f"{kind} actions of predict", _predict(twin, deterministic), act(deterministic)
+        if isinstance(twin, ActorCriticPolicy):
+            yield (
+                f"{kind} actions of the rollout",
+                _forward(twin, deterministic),
+                act(deterministic),
+            )
+
+
+def _predict(twin: Any, deterministic: bool) -> _Compute:
+    return lambda x: twin._predict(x, deterministic=deterministic)
+
+
+def _forward(twin: Any, deterministic: bool) -> _Compute:
+    return lambda x: twin(x, deterministic)[0]
 
 
 def _pairs(
@@ -239,7 +307,9 @@ def _observations(space: spaces.Space[np.ndarray]) -> np.ndarray:
     wide = _wide(rng, space.shape)
     if np.issubdtype(space.dtype, np.floating):
         return wide.astype(space.dtype)
-    low, high = np.maximum(space.low, -(2**31)), np.minimum(space.high, 2.0**31)
+    low, high = (
+        bound.astype(np.float64).clip(-(2.0**31), 2.0**31) for bound in (space.low, space.high)
+    )
     return rng.uniform(low, high, wide.shape).astype(space.dtype)
 
 

@@ -132,7 +132,7 @@ class Policy:
                 do="pass observations of the run's environment",
             )
         inputs = self.normalize(observation if batched else observation[None])
-        actions = self._choose(torch.from_numpy(inputs), deterministic)
+        actions = to_actions(self.spec, self.choose(torch.from_numpy(inputs), deterministic))
         return (actions if batched else actions.squeeze(0)), state
 
     @torch.no_grad()
@@ -147,16 +147,19 @@ class Policy:
             return outputs, None
         return outputs, functional.linear(hidden, *self._deviation).clamp(*LOG_STD_RANGE).exp()
 
-    def _choose(self, inputs: Tensor, deterministic: bool) -> np.ndarray:
+    @torch.no_grad()
+    def choose(self, inputs: Tensor, deterministic: bool) -> Tensor:
+        """Actions for network inputs ``(batch, *observation)``: not shaped, nor within bounds.
+
+        Of a squashed policy: before tanh.
+        """
         if not self.spec.is_sampled:
             outputs, _ = self._outputs(inputs)
-            greedy = self.spec.mode == "greedy"
-            return to_actions(self.spec, outputs.argmax(1) if greedy else outputs)
+            return outputs.argmax(1) if self.spec.mode == "greedy" else outputs
         distribution = self.distribution(inputs)
         if isinstance(distribution, Categorical):
-            choice = distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call]
-            return to_actions(self.spec, choice)
-        return to_actions(self.spec, distribution.mean if deterministic else distribution.rsample())
+            return distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call, no-any-return]
+        return distribution.mean if deterministic else distribution.rsample()
 
     def __repr__(self) -> str:
         units = [len(bias) for _, bias in self._layers]
