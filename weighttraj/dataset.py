@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-from weighttraj import overview
+from weighttraj import frames, overview
 from weighttraj.errors import FormatError
 from weighttraj.format.schema import DatasetInfo
 from weighttraj.remote.address import Place
 from weighttraj.run import Run
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from weighttraj.load.windows import SnapshotDataset, WindowDataset
 
 
@@ -67,23 +69,51 @@ class Dataset:
         runs = [run for run in self.runs if all(_has(run, k, v) for k, v in wanted.items())]
         return Dataset(self.path, self.info, runs)
 
-    def to_torch(self, window: int = 20, *, stride: int = 1) -> WindowDataset:
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table with a row for each run, indexed by run id.
+
+        Columns: split, seed, environment, numbers of snapshots and parameters, returns and
+        hyper-parameters. Needs the extra ``files``.
+        """
+        return frames.runs_frame(self.runs)
+
+    def to_torch(
+        self,
+        window: int = 20,
+        *,
+        stride: int = 1,
+        fields: Sequence[str] = ("weights",),
+        evaluated: bool = False,
+    ) -> WindowDataset:
         """Windows of consecutive snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
 
-        See ``weighttraj.load.WindowDataset``.
+        Args:
+            window: snapshots in a window.
+            stride: snapshots from one window's end to the next one's.
+            fields: what an item holds: ``weights``, ``returns``, ``mean_return``, ``obs_norm``, a
+                counter such as ``num_timesteps``, or any array with a row for each snapshot.
+            evaluated: only windows whose last snapshot has a mean return.
         """
         from weighttraj.load.windows import WindowDataset
 
-        return WindowDataset(self.runs, window=window, stride=stride)
+        return WindowDataset(
+            self.runs, window=window, stride=stride, fields=fields, evaluated=evaluated
+        )
 
-    def to_torch_snapshots(self, *, stride: int = 1) -> SnapshotDataset:
+    def to_torch_snapshots(
+        self,
+        *,
+        stride: int = 1,
+        fields: Sequence[str] = ("weights",),
+        evaluated: bool = False,
+    ) -> SnapshotDataset:
         """Single snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
 
-        See ``weighttraj.load.SnapshotDataset``.
+        Arguments are those of ``to_torch``.
         """
         from weighttraj.load.windows import SnapshotDataset
 
-        return SnapshotDataset(self.runs, stride=stride)
+        return SnapshotDataset(self.runs, stride=stride, fields=fields, evaluated=evaluated)
 
     def __len__(self) -> int:
         return len(self.runs)

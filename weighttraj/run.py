@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from weighttraj import frames
 from weighttraj.errors import DamageError, FormatError, RowError
 from weighttraj.format.layout import ParamLayout
 from weighttraj.format.schema import RETURNS, ArraySpec, Evaluation, RunEntry, RunInfo
@@ -20,6 +21,9 @@ from weighttraj.store.codecs import BLOCK_BYTES
 from weighttraj.text import printable
 
 if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
     from weighttraj.collect.into import Target
     from weighttraj.policies.policy import Policy
 
@@ -325,6 +329,21 @@ class Run:
     def ret_norm(self, t: int) -> NormStats | None:
         """Statistics of the reward normaliser at snapshot t; None: the run has none."""
         return self._stats("ret_norm", t) if self.info.ret_norm else None
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table with a row for each snapshot, indexed by snapshot.
+
+        Columns: counters (``num_timesteps``, ``iteration``, ...), diagnostics
+        (``train.approx_kl``, ...) and mean returns. Needs the extra ``files``.
+        """
+        return frames.snapshots_frame(self)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return all arrays as one xarray data set, read when they are used.
+
+        Needs the extra ``files``.
+        """
+        return frames.run_dataset(self)
 
     def load_policy(self, t: int = -1) -> Policy:
         """The policy of snapshot t, which acts as the agent did. Needs the extra ``sb3``.

@@ -7,7 +7,7 @@ import json
 import warnings
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torch.utils.data import Dataset, default_collate, get_worker_info
 
 from weighttraj.errors import WindowError
 from weighttraj.load.cache import CachedWeights
+from weighttraj.load.fields import WEIGHTS, expand, mean_returns, values
 from weighttraj.remote.address import RemotePath
 from weighttraj.run import Run
 
@@ -25,9 +26,9 @@ MAX_MAPS = 200
 
 
 class Item(TypedDict):
-    """One item."""
+    """One item. It also has one tensor for each other field that was asked for."""
 
-    weights: Tensor
+    weights: NotRequired[Tensor]
     """float32 (window, param) of a window; (param,) of a snapshot."""
     t: int
     """Snapshot of its last row; the rows are t - window + 1, ..., t."""
@@ -36,9 +37,9 @@ class Item(TypedDict):
 
 
 class Batch(TypedDict):
-    """Items that were put together."""
+    """Items that were put together, with one tensor for each other field that was asked for."""
 
-    weights: Tensor
+    weights: NotRequired[Tensor]
     """float32 (batch, window, param) of windows; (batch, param) of snapshots."""
     t: Tensor
     """int64 (batch,)."""
@@ -49,28 +50,45 @@ class Batch(TypedDict):
 class RunDataset(Dataset[Item]):
     """Base of the data sets below: pieces of runs, each inside one run and known by (run, t).
 
-    Rows come from the cache, where a run is decoded when its first row is asked for; worker
-    processes may be forked or spawned.
+    Weights come from the cache, where a run is decoded when its first row is asked for; worker
+    processes may be forked or spawned. Other fields are held in memory.
     """
 
     window: int
     """Snapshots in an item."""
 
-    def __init__(self, runs: Sequence[Run], window: int, stride: int) -> None:
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        window: int,
+        stride: int,
+        fields: Sequence[str] = ("weights",),
+        evaluated: bool = False,
+    ) -> None:
         _check(runs, window, stride)
         self.runs = list(runs)
         self.window = window
         self.stride = stride
+        self.fields = expand(fields, self.runs)
+        """Names of the tensors in an item."""
+        self.evaluated = evaluated
         counts = [(len(run) - window) // stride + 1 for run in runs]
         run = np.repeat(np.arange(len(runs)), counts)
         t = np.concatenate([window - 1 + stride * np.arange(n) for n in counts])
         self.index = np.stack([run, t], axis=1)
         """int64 (item, 2): position of the run in ``runs``, and t."""
+        if evaluated:
+            means = [mean_returns(run) for run in runs]
+            self.index = self.index[[bool(np.isfinite(means[r][t])) for r, t in self.index]]
+            _check_some(self.index, runs)
         self._ids = [run.id for run in runs]
+        self._others = [name for name in self.fields if name != WEIGHTS]
+        self._values: dict[int, dict[str, np.ndarray]] = {}
         self._cached = [CachedWeights(run) for run in runs]
-        for cached in self._cached:
+        for position, cached in enumerate(self._cached):
             if isinstance(cached.run.path, RemotePath):
                 cached.map()  # now: a forked worker could not read it
+                self._fields_of(position)
         self._maps: dict[int, np.ndarray] = {}
 
     @cached_property
@@ -81,7 +99,9 @@ class RunDataset(Dataset[Item]):
             DamageError: a run's digests are damaged.
         """
         runs = [(cached.run.id, cached.key) for cached in self._cached]
-        what = [type(self).__name__, self.window, self.stride, runs]
+        what: list[Any] = [type(self).__name__, self.window, self.stride, runs]
+        if self._others or self.evaluated:
+            what += [self.fields, self.evaluated]
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def batch(self, indices: Sequence[int]) -> Batch:
@@ -92,9 +112,19 @@ class RunDataset(Dataset[Item]):
             CacheError: the cache's folder cannot be used.
             DamageError: a run is damaged.
         """
-        views, t, run = self._find(indices)
-        weights = _stack(views) if get_worker_info() is None else _stack_shared(views)
-        return Batch(weights=weights, t=torch.from_numpy(t), run=run)
+        index = self.index[np.asarray(indices)]
+        pairs = index.tolist()
+        stack = _stack if get_worker_info() is None else _stack_shared
+        batch: dict[str, Any] = {}
+        if WEIGHTS in self.fields:
+            batch[WEIGHTS] = stack([self._view(run, t) for run, t in pairs])
+        for name in self._others:
+            batch[name] = stack([self._field(name, run, t) for run, t in pairs])
+        batch |= {
+            "t": torch.from_numpy(index[:, 1].copy()),
+            "run": [self._ids[r] for r, _ in pairs],
+        }
+        return cast(Batch, batch)
 
     def __len__(self) -> int:
         return len(self.index)
@@ -102,23 +132,37 @@ class RunDataset(Dataset[Item]):
     def __getitem__(self, i: int) -> Item:
         """One item; raises as ``batch`` does."""
         run, t = self.index[i].tolist()
-        return Item(weights=torch.from_numpy(self._view(run, t).copy()), t=t, run=self._ids[run])
+        if not self._others:
+            weights = torch.from_numpy(self._view(run, t).copy())
+            return {"weights": weights, "t": t, "run": self._ids[run]}
+        item: Any = {"t": t, "run": self._ids[run]}
+        if WEIGHTS in self.fields:
+            item[WEIGHTS] = torch.from_numpy(self._view(run, t).copy())
+        for name in self._others:
+            item[name] = torch.from_numpy(np.array(self._field(name, run, t)))
+        return cast(Item, item)
 
     def __getitems__(self, indices: Sequence[int]) -> list[Item]:
         """Items of one batch, for torch's ``DataLoader``; faster than one by one."""
-        views, t, run = self._find(indices)
-        columns = zip(_stack(views).unbind(0), t.tolist(), run, strict=True)
-        return [Item(weights=w, t=t, run=run) for w, t, run in columns]
-
-    def _find(self, indices: Sequence[int]) -> tuple[list[np.ndarray], np.ndarray, list[str]]:
-        """Rows, t and run id of some items."""
-        index = self.index[np.asarray(indices)]
-        views = [self._view(run, t) for run, t in index.tolist()]
-        return views, index[:, 1].copy(), [self._ids[run] for run in index[:, 0].tolist()]
+        batch: dict[str, Any] = {**self.batch(indices)}
+        columns = [
+            value.tolist() if name == "t" else value if name == "run" else value.unbind(0)
+            for name, value in batch.items()
+        ]
+        return [
+            cast(Item, dict(zip(batch, row, strict=True))) for row in zip(*columns, strict=True)
+        ]
 
     def _view(self, run: int, t: int) -> np.ndarray:
         """Rows of the map itself. To write to them would end the process: copies go out."""
-        return self._rows(run)[t - self.window + 1 : t + 1]
+        rows = self._maps.get(run)
+        if rows is None:
+            rows = self._rows(run)
+        return rows[t - self.window + 1 : t + 1]
+
+    def _field(self, name: str, run: int, t: int) -> np.ndarray:
+        """Rows of another field, as ``_view`` those of the weights."""
+        return self._fields_of(run)[name][t - self.window + 1 : t + 1]
 
     def _rows(self, run: int) -> Float32[np.ndarray, "time param"]:
         rows = self._maps.get(run)
@@ -127,6 +171,12 @@ class RunDataset(Dataset[Item]):
                 del self._maps[next(iter(self._maps))]
             rows = self._maps[run] = self._cached[run].map()
         return rows
+
+    def _fields_of(self, run: int) -> dict[str, np.ndarray]:
+        """All other fields of a run, read when the first item of it is asked for."""
+        if run not in self._values:
+            self._values[run] = {name: values(self.runs[run], name) for name in self._others}
+        return self._values[run]
 
     def __getstate__(self) -> dict[str, Any]:
         """What a spawned worker gets: where the rows are, not the rows."""
@@ -140,13 +190,24 @@ class WindowDataset(RunDataset):
         runs: runs of the same layout.
         window: snapshots in a window, K.
         stride: snapshots from one window's end to the next one's.
+        fields: what an item holds; see ``weighttraj.load.fields``.
+        evaluated: only windows whose last snapshot has a mean return.
 
     Raises:
-        WindowError: the runs differ in layout, or a run is shorter than a window.
+        WindowError: the runs differ in layout, a run is shorter than a window, or a run stores no
+            such field.
     """
 
-    def __init__(self, runs: Sequence[Run], window: int = 20, *, stride: int = 1) -> None:
-        super().__init__(runs, window, stride)
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        window: int = 20,
+        *,
+        stride: int = 1,
+        fields: Sequence[str] = ("weights",),
+        evaluated: bool = False,
+    ) -> None:
+        super().__init__(runs, window, stride, fields, evaluated)
 
     def __repr__(self) -> str:
         size = self.runs[0].layout.size
@@ -161,17 +222,29 @@ class SnapshotDataset(RunDataset):
     Args:
         runs: runs of the same layout.
         stride: snapshots from one item to the next; the first is snapshot 0.
+        fields: what an item holds; see ``weighttraj.load.fields``.
+        evaluated: only snapshots that have a mean return.
 
     Raises:
-        WindowError: the runs differ in layout, or a run has no snapshots.
+        WindowError: the runs differ in layout, a run has no snapshots, or stores no such field.
     """
 
-    def __init__(self, runs: Sequence[Run], *, stride: int = 1) -> None:
-        super().__init__(runs, 1, stride)
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        *,
+        stride: int = 1,
+        fields: Sequence[str] = ("weights",),
+        evaluated: bool = False,
+    ) -> None:
+        super().__init__(runs, 1, stride, fields, evaluated)
 
     def _view(self, run: int, t: int) -> np.ndarray:
         row: np.ndarray = self._rows(run)[t]
         return row
+
+    def _field(self, name: str, run: int, t: int) -> np.ndarray:
+        return np.asarray(self._fields_of(run)[name][t])
 
     def __repr__(self) -> str:
         size = self.runs[0].layout.size
@@ -180,6 +253,8 @@ class SnapshotDataset(RunDataset):
 
 def _stack(views: list[np.ndarray]) -> Tensor:
     """Copies of some rows, put together. Numpy's memory comes in huge pages, torch's does not."""
+    if not views[0].ndim:
+        return torch.from_numpy(np.array(views))
     return torch.from_numpy(np.concatenate(views).reshape(len(views), *views[0].shape))
 
 
@@ -189,6 +264,16 @@ def _stack_shared(views: list[np.ndarray]) -> Tensor:
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
         stacked: Tensor = default_collate([torch.from_numpy(view) for view in views])
         return stacked
+
+
+def _check_some(index: np.ndarray, runs: Sequence[Run]) -> None:
+    if not len(index):
+        raise WindowError(
+            "no snapshot of these runs has a mean return",
+            got=f"{len(runs)} runs",
+            where=runs[0].path,
+            do="evaluate the snapshots with `weighttraj returns`",
+        )
 
 
 def _check(runs: Sequence[Run], window: int, stride: int) -> None:

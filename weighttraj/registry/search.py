@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from weighttraj.errors import RegistryError, WeightTrajError, missing_extra
+from weighttraj.frames import HYPERPARAMETER
 from weighttraj.opening import open_dataset
 from weighttraj.registry.local import LocalDataset, local_datasets
-from weighttraj.tools.tables import HYPERPARAMETER, RUN_COLUMNS, RUNS, read_table, runs_table
+from weighttraj.tools.tables import RUN_COLUMNS, RUNS, read_table, runs_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,7 @@ import numpy as np
 from weighttraj.atomic import replacing
 from weighttraj.dataset import Dataset
 from weighttraj.errors import DamageError, FormatError, MissingExtraError, missing_extra
-from weighttraj.run import Run
+from weighttraj.frames import MEAN_RETURNS, run_row, snapshot_columns, step_sizes
 from weighttraj.store.objects import FolderObjects
 from weighttraj.text import printable, shortened
 
@@ -21,14 +21,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    from weighttraj.run import Run
+
 RUNS, SNAPSHOTS = "tables/runs.parquet", "tables/snapshots.parquet"
 
 _BASE_BYTES, _ROW_BYTES = 16 << 20, 4 << 10
 """Decoded bytes that a table may have, and more for each of its rows."""
-
-_ROWS = 64
-"""Snapshots that are held at a time: of a large policy they fill memory."""
-
 
 RUN_COLUMNS = {
     "run_id": "string",
@@ -45,9 +43,6 @@ RUN_COLUMNS = {
     "created": "string",
 }
 """Columns of the table of runs, and their Arrow types; hyper-parameters follow."""
-
-HYPERPARAMETER = "hyperparameters."
-"""What the names of columns of hyper-parameters begin with."""
 
 _NORMS = ("weight_norm", "step_norm")
 """Columns that are computed, and may differ in the last digits on another machine."""
@@ -86,10 +81,17 @@ def runs_table(dataset: Dataset) -> pa.Table:
 def snapshots_table(dataset: Dataset) -> pa.Table:
     """The table of snapshots, one row each; runs lack values of arrays that they do not store."""
     pa = _pyarrow()
-    parts = [pa.table(snapshot_columns(run)) for run in dataset]
+    parts = [pa.table(_snapshot_columns(run)) for run in dataset]
     if not parts:
         return pa.table({"run_id": pa.array([], "string"), "t": pa.array([], "int64")})
     return pa.concat_tables(parts, promote_options="default")
+
+
+def _snapshot_columns(run: Run) -> dict[str, Any]:
+    """The columns of one run: norms of the weights too, masked values for nulls."""
+    columns = snapshot_columns(run)
+    means = {n: np.ma.masked_invalid(columns.pop(n)) for n in MEAN_RETURNS}
+    return {"run_id": [run.id] * len(run), **columns, **step_sizes(run), **means}
 
 
 def _free(values: list[Any], otherwise: str) -> pa.Array:
@@ -282,67 +284,6 @@ def _differing(one: pa.ChunkedArray, other: pa.ChunkedArray, computed: bool) -> 
         return np.zeros(0, int)
     pairs = zip(one.to_pylist(), other.to_pylist(), strict=True)
     return np.flatnonzero([a != b for a, b in pairs])
-
-
-def run_row(run: Run) -> dict[str, Any]:
-    """What the table of runs says of one."""
-    info = run.info
-    row = {
-        "run_id": run.id,
-        "split": run.split,
-        "seed": info.seed,
-        "env": info.env.id if info.env else None,
-        "algorithm": info.algorithm.name if info.algorithm else None,
-        "status": info.status,
-        "n_snapshots": len(run),
-        "n_params": run.layout.size,
-        "num_timesteps": int(run.num_timesteps[-1]) if len(run) else 0,
-        "final_return": run.final_return,
-        "final_mean_return": None if np.isnan(run.final_mean_return) else run.final_mean_return,
-        "created": info.provenance.created,
-    }
-    hyperparameters = info.algorithm.hyperparameters if info.algorithm else {}
-    plain = {k: v for k, v in hyperparameters.items() if isinstance(v, bool | int | float | str)}
-    return row | {f"{HYPERPARAMETER}{name}": value for name, value in plain.items()}
-
-
-def snapshot_columns(run: Run) -> dict[str, Any]:
-    """What the table of snapshots says of a run: every array with one number a snapshot.
-
-    Masked values are null in the table.
-    """
-    weights = run.weights
-    norms, steps, last = [], [], None
-    for start in range(0, len(run), _ROWS):
-        rows = weights[start : start + _ROWS].astype(np.float64)
-        norms.append(np.linalg.norm(rows, axis=1))
-        steps.append(
-            np.linalg.norm(
-                np.diff(rows, axis=0, prepend=rows[:1] if last is None else last), axis=1
-            )
-        )
-        last = rows[-1:]
-    scalars = {
-        name.removeprefix("index/").replace("/", "."): array[:]
-        for name, array in run.arrays.items()
-        if array.dims == ("time",)
-    }
-    return {
-        "run_id": [run.id] * len(run),
-        "t": np.arange(len(run)),
-        **scalars,
-        "weight_norm": np.concatenate(norms) if norms else np.zeros(0),
-        "step_norm": np.concatenate(steps) if steps else np.zeros(0),
-        "mean_return_deterministic": _mean_returns(run, deterministic=True),
-        "mean_return_sampled": _mean_returns(run, deterministic=False),
-    }
-
-
-def _mean_returns(run: Run, *, deterministic: bool) -> np.ma.MaskedArray[Any, Any]:
-    """Mean return of each snapshot over the episodes of a mode, masked where it has none."""
-    if run.evaluation is None or deterministic not in run.evaluation.deterministic:
-        return np.ma.masked_invalid(np.full(len(run), np.nan))
-    return np.ma.masked_invalid(run.mean_return(deterministic))
 
 
 def _write(folder: Path, name: str, table: pa.Table) -> None:
