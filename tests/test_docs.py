@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+import torch
+
 import tipl
 import weighttraj as wt
 from tests.pages import QUICKER, blocks, run_command, run_page
@@ -56,7 +58,8 @@ def test_read(reader: Path) -> None:
     run_page(DOCS / "index.md")
     names = run_page(DOCS / "read.md")
     assert names["weights"].shape == (122, 1951)
-    assert names["second"]["weights"].shape == (4, 20, 122)
+    assert names["batch"]["weights"].shape == (32, 122)
+    assert torch.isfinite(names["error"]).all()
     assert len(wt.open("data/demo/divided.h5")) == 5
 
 
