@@ -33,9 +33,6 @@ HEAVY_FOR_COMMANDS = ["torch", "zarr", "stable_baselines3", "mujoco", "matplotli
         "tipl --version",
         "tipl zoo",
         "tipl train --help",
-        "weighttraj --help",
-        "weighttraj --version",
-        "weighttraj list --help",
     ],
 )
 def test_a_list_of_models_or_commands_loads_nothing_heavy(command: str) -> None:
@@ -49,7 +46,9 @@ def test_a_list_of_models_or_commands_loads_nothing_heavy(command: str) -> None:
     assert said.endswith("[]"), said
 
 
-@pytest.mark.parametrize("command", ["list", "show inverted-pendulum-v4-ppo-v1"])
+@pytest.mark.parametrize(
+    "command", ["--help", "--version", "list --help", "list", "show inverted-pendulum-v4-ppo-v1"]
+)
 def test_a_look_at_data_sets_loads_no_torch(command: str) -> None:
     heavy = ["torch", "stable_baselines3", "mujoco", "matplotlib", "gymnasium"]
     said = run(

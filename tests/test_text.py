@@ -7,6 +7,7 @@ import io
 import json
 import pickle
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from tests.benchmarks.stress_format import live_copy
 from weighttraj.cli import main
 from weighttraj.errors import FormatError, RemoteError
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info
+from weighttraj.store.live import LiveStore
 from weighttraj.terminal import Output, say
 from weighttraj.text import markdown, printable, yaml
 
@@ -105,7 +107,7 @@ def hostile(small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert run.info.algorithm is not None
     copy = path / f"runs/{run.id}.zarr"
     live_copy(run, copy, 25, 6, "complete")
-    store = wt.format.live.LiveStore.open(copy)
+    store = LiveStore.open(copy)
     info = replace(
         store.info,
         env=replace(run.info.env, id=bad, wrappers=(bad,)),
@@ -114,7 +116,7 @@ def hostile(small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     )
     store.commit(info)
     wt.pack(copy)
-    wt.format.integrity.shutil.rmtree(copy)
+    shutil.rmtree(copy)
     listed = read_dataset_info(small_dataset)
     entry = replace(listed.runs[0], path=f"runs/{run.id}.zarr.zip")
     new = replace(listed, runs=(entry,), version=bad, licence=bad, recipe={bad: bad})

@@ -202,9 +202,9 @@ def test_a_process_killed_by_hand_leaves_no_entry(wide_run: wt.Run, cache: Path)
 KILLED_WHEN_IT_WRITES = """
 import os, signal, sys
 import weighttraj as wt
-from weighttraj.format import reader
+from weighttraj import run
 from weighttraj.load import CachedWeights
-reader.PIECE_BYTES = 1
+run.PIECE_BYTES = 1
 pieces = CachedWeights._pieces
 def kill_at(self):
     written = 0

@@ -142,11 +142,11 @@ def test_sealing_on_a_full_disk_goes_on(reference: Path, disk: Path) -> None:
     used = sum(p.stat().st_blocks * 512 for p in path.rglob("*"))
     (disk / "ballast").write_bytes(bytes((4 << 20) - used - (12 << 10)))
     with pytest.raises(OSError, match="No space left"):
-        wt.format.seal(path)
+        wt.seal(path)
     assert [p.name for p in path.rglob(".*")] == [COSTS]
     assert contents(path) == contents(reference)
     (disk / "ballast").unlink()
-    wt.format.seal(path)
+    wt.seal(path)
     assert wt.verify(path, deep=True) == []
 
 

@@ -198,7 +198,7 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 import weighttraj as wt
-from weighttraj.format import ParamLayout, RunInfo, RunWriter
+from weighttraj import ParamLayout, RunInfo, RunWriter
 size = int(sys.argv[2])
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 path = Path(sys.argv[1]) / "run.zarr"

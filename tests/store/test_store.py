@@ -202,7 +202,7 @@ KILLED_WHILE_WRITING = """
 import os, signal, sys
 from pathlib import Path
 from tests.store.test_store import INFO, RunWriter, append, weights
-from weighttraj.format import live as storage
+from weighttraj.store import live as storage
 
 def kill_at(n):
     calls = 0
@@ -616,7 +616,7 @@ def test_a_kill_between_a_rewritten_block_and_its_commit_loses_nothing(tmp_path:
         "import os, signal, sys\n"
         "from pathlib import Path\n"
         "from tests.store.test_store import INFO, RunWriter, append, weights\n"
-        "from weighttraj.format import live\n"
+        "from weighttraj.store import live\n"
         "writer = RunWriter(Path(sys.argv[1]), INFO, resume=True)\n"
         "kill = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
         "for t, row in enumerate(weights(16)):\n"
