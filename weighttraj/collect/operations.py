@@ -66,11 +66,11 @@ class _Operation:
     """Whether it changes a tensor in place, on which anything may depend."""
 
 
-class _Dispatched(TorchDispatchMode):
+class _Dispatched(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Notes each operation on what was computed from the observations."""
 
     def __init__(self, observations: Tensor) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         # The tensors are kept, so that no later one gets the id of an earlier one.
         self._computed = {id(observations): observations}
         self._operations: list[_Operation] = []

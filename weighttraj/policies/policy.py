@@ -158,7 +158,7 @@ class Policy:
             return outputs.argmax(1) if self.spec.mode == "greedy" else outputs
         distribution = self.distribution(inputs)
         if isinstance(distribution, Categorical):
-            return distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call, no-any-return]
+            return distribution.probs.argmax(1) if deterministic else distribution.sample()  # type: ignore[no-untyped-call]
         return distribution.mean if deterministic else distribution.rsample()
 
     def __repr__(self) -> str:
