@@ -318,7 +318,7 @@ def _contents(recipe: Recipe, facts: Facts) -> Iterator[str]:
     yield f"- {_evaluation(facts.evaluated)}"
     yield f"- Made by {facts.made_by}."
     if recipe.seeds.test:
-        yield "- Evaluate forecasts on the `test` runs alone; make choices on the `validation` runs."
+        yield "- Evaluate forecasts on the `test` runs; make choices on the `validation` runs."
 
 
 def _evaluation(stored: Returns | None) -> str:
