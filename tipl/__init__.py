@@ -12,7 +12,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tipl.checks.measures import Checks, check
+    from tipl.checks.measures import check
+    from tipl.checks.results import Checks
     from tipl.evaluation.config import EvaluateConfig
     from tipl.forecaster import Forecaster
     from tipl.models.baselines import (
@@ -23,13 +24,13 @@ if TYPE_CHECKING:
     )
     from tipl.models.tipl import TIPL, GPTConfig, TrainConfig, train
     from tipl.registry import Kind, load, register
-    from tipl.report.evaluate import evaluate
+    from tipl.report.page import evaluate
     from tipl.representation import TemporalSVD
     from tipl.training import LoopConfig, change
     from tipl.zoo.remote import push
 
 _PLACES = {
-    "Checks": "tipl.checks.measures",
+    "Checks": "tipl.checks.results",
     "EvaluateConfig": "tipl.evaluation.config",
     "Forecaster": "tipl.forecaster",
     "GPTConfig": "tipl.models.tipl",
@@ -42,7 +43,7 @@ _PLACES = {
     "TrainConfig": "tipl.models.tipl",
     "change": "tipl.training",
     "check": "tipl.checks.measures",
-    "evaluate": "tipl.report.evaluate",
+    "evaluate": "tipl.report.page",
     "fit_baselines": "tipl.models.baselines",
     "load": "tipl.registry",
     "push": "tipl.zoo.remote",

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import difflib
-import importlib
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tipl.registry import Kind, commands
+from tipl.registry import Kind, commands, imported
 from weighttraj.errors import WeightTrajError
 from weighttraj.terminal import Output, say, while_read
 
@@ -99,7 +98,7 @@ def _run(arguments: list[str]) -> None:
     elif arguments[0] == "train":
         _train(arguments[1:])
     elif arguments[0] in COMMANDS:
-        _call(arguments[0], _function(COMMANDS[arguments[0]].function), arguments[1:])
+        _call(arguments[0], imported(COMMANDS[arguments[0]].function), arguments[1:])
     else:
         _refuse(arguments[0], list(COMMANDS))
 
@@ -117,7 +116,7 @@ def _train(arguments: list[str]) -> None:
 def _trainer(kind: Kind) -> Callable[..., None]:
     from tipl.commands.train import trainer
 
-    return trainer(kind.train_function())
+    return trainer(imported(str(kind.train)))
 
 
 def _call(name: str, function: Callable[..., None], arguments: Sequence[str]) -> None:
@@ -125,12 +124,6 @@ def _call(name: str, function: Callable[..., None], arguments: Sequence[str]) ->
 
     config = (tyro.conf.OmitArgPrefixes,)
     tyro.cli(function, prog=f"tipl {name}", args=list(arguments), config=config)
-
-
-def _function(path: str) -> Callable[..., None]:
-    module, _, name = path.partition(":")
-    function: Callable[..., None] = getattr(importlib.import_module(module), name)
-    return function
 
 
 def _help(console: Console, only: str | None = None) -> None:
@@ -177,7 +170,7 @@ def _complete(arguments: Sequence[str]) -> None:
     app: Any = tyro.extras.SubcommandApp()
     train: Any = tyro.extras.SubcommandApp()
     for name, command in COMMANDS.items():
-        app.command(_function(command.function), name=name)
+        app.command(imported(command.function), name=name)
     for name, kind in commands().items():
         train.command(_trainer(kind), name=name)
     app.command(train, name="train")

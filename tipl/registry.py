@@ -17,7 +17,6 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -34,7 +33,7 @@ GROUP = "tipl.kinds"
 """Group of entry points."""
 MODELS = Path(__file__).parent / "zoo/models"
 """Folder of the released models, which come with the package."""
-UNFITTED = "tipl.models.baselines.unfitted:UNFITTED"
+UNFITTED = "tipl.models.baselines.naive:UNFITTED"
 """The baselines that need no fit."""
 MOST_CONFIG = 2**20
 """Largest size of config.json, in bytes."""
@@ -61,18 +60,6 @@ class Kind:
     is_model: bool = False
     """Whether it is a model to be compared with baselines, and not a baseline."""
 
-    def forecaster_class(self) -> type[Forecaster]:
-        """Return the class."""
-        return imported(self.forecaster)  # type: ignore[no-any-return]
-
-    def train_function(self) -> Callable[..., Any]:
-        """Return the function that trains it."""
-        return imported(str(self.train))  # type: ignore[no-any-return]
-
-    def refit_function(self) -> Callable[..., Forecaster]:
-        """Return the function that fits one like it."""
-        return imported(str(self.refit))  # type: ignore[no-any-return]
-
 
 def register(kind: Kind) -> None:
     """Add a kind; one of the same name is replaced."""
@@ -91,11 +78,6 @@ def kinds() -> dict[str, Kind]:
 def commands() -> dict[str, Kind]:
     """Return the kind that each ``tipl train`` command trains."""
     return {kind.command: kind for kind in kinds().values() if kind.command and kind.train}
-
-
-def kind_of(forecaster: Forecaster) -> Kind | None:
-    """Return the kind of a forecaster; None: it is not registered."""
-    return kinds().get(forecaster.kind)
 
 
 def is_model(kind: str | None) -> bool:
@@ -156,7 +138,8 @@ def load_folder(folder: Path) -> Forecaster:
     Raises:
         ModelError: the folder holds none.
     """
-    return kinds()[kind_in(folder)].forecaster_class().load(folder)
+    forecaster: Forecaster = imported(kinds()[kind_in(folder)].forecaster).load(folder)
+    return forecaster
 
 
 def folder_of(name: str | Path) -> Path | None:

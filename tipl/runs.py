@@ -131,14 +131,16 @@ def without_faults(
     Returns:
         The other runs; and the faults, by the id of the run.
     """
-    kept, faults = [], {}
-    for run in runs:
-        if (why := fault(run)) is None:
-            kept.append(run)
-        else:
-            faults[run.id] = why
-            warnings.warn(f"run {run.id} is left out: {why}", LeftOutWarning, stacklevel=3)
-    return kept, faults
+    found = [(run, fault(run)) for run in runs]
+    faults = {run.id: why for run, why in found if why is not None}
+    for run, why in faults.items():
+        warn_left_out(run, why)
+    return [run for run, why in found if why is None], faults
+
+
+def warn_left_out(run: str, why: str) -> None:
+    """Warn that a run, named by its id, is left out."""
+    warnings.warn(f"run {run} is left out: {why}", LeftOutWarning, stacklevel=4)
 
 
 _KNOWN: WeakKeyDictionary[Run, CachedWeights | np.ndarray] = WeakKeyDictionary()

@@ -38,7 +38,18 @@ LEAST_SIZE = 10_000
 T = TypeVar("T")
 N = TypeVar("N", bound=nn.Module)
 C = TypeVar("C")
+F = TypeVar("F", bound="SavedSettings")
 S = TypeVar("S", bound="SavedNetwork[Any, Any]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig(Generic[C]):
+    """What a saved network says of itself."""
+
+    network: C
+    """Sizes of the network."""
+    every: int | None
+    """Gradient steps from one snapshot to the next in the training runs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +90,20 @@ class SavedNetwork(Forecaster, Generic[N, C]):
         config: Any = read_config(path, str(cls.kind), cls.config_type)
         network = load_network(lambda: cls.build(config), config, path)
         return cls(network, config, Path(path).resolve().name)
+
+
+@dataclass(frozen=True)
+class SavedSettings(Forecaster):
+    """Base of the forecasters that are their settings, the fields: nothing is fitted."""
+
+    def save(self, path: str | Path) -> None:
+        """Write config.json."""
+        write(path, {"kind": self.kind, **asdict(self)})
+
+    @classmethod
+    def load(cls: type[F], path: str | Path) -> F:
+        """Read the settings."""
+        return read_config(path, str(cls.kind), cls)
 
 
 def write(

@@ -78,6 +78,11 @@ class Clock:
         first = known[0] if len(known) else 1.0
         return cls(phase=np.asarray(run.phase), rate=np.nan_to_num(rates / first, nan=1.0))
 
+    def numbers(self, t: int) -> tuple[float, float, float]:
+        """Return the time of a snapshot as networks see it: its index, its learning rate twice."""
+        rate = float(self.rate[t])
+        return np.log1p(t) / 4, rate, np.log(rate + 1e-3) / 3
+
 
 def _kind(role: str, axes: tuple[str, ...]) -> int:
     names = {

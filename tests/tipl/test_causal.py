@@ -11,9 +11,10 @@ from rich.console import Console
 import weighttraj as wt
 from tests.tipl.lively import CAUSAL, HORIZONS, lively_causal
 from tipl import change
-from tipl.checks import RefitConfig, refit_of
-from tipl.checks.copies import random_walks, run_like
-from tipl.checks.measures import NULL, skills
+from tipl.checks.copies import RefitConfig, random_walks, run_like
+from tipl.checks.measures import skills
+from tipl.checks.model import refit_of
+from tipl.checks.results import NULL
 from tipl.errors import ForecastError, LeftOutWarning, ModelError, TrainError
 from tipl.models.causal import Causal, CausalTrainConfig, train_causal
 from tipl.models.causal.forecaster import CausalModelConfig

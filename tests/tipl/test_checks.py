@@ -11,11 +11,8 @@ import weighttraj as wt
 from tests.tipl.lively import HORIZONS as SOME
 from tests.tipl.lively import lively_causal, lively_gate
 from tipl import TIPL, Persistence, Reconstruction
-from tipl.checks import RefitConfig, refit_of
-from tipl.checks.copies import random_symmetry, random_walks, run_like
+from tipl.checks.copies import RefitConfig, random_symmetry, random_walks, run_like
 from tipl.checks.measures import (
-    NULL,
-    TOLERANCE,
     Fit,
     causality,
     check,
@@ -24,6 +21,8 @@ from tipl.checks.measures import (
     scale,
     skills,
 )
+from tipl.checks.model import refit_of
+from tipl.checks.results import NULL, TOLERANCE
 from tipl.forecaster import Forecaster
 from tipl.models.baselines import (
     DMD,

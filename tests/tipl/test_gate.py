@@ -15,16 +15,15 @@ import weighttraj as wt
 from tests.small import SMALL_RECIPE
 from tests.tipl.lively import GATE, HORIZONS, lively_gate
 from tipl import change
-from tipl.checks import RefitConfig, refit_of
-from tipl.checks.copies import random_walks, run_like
+from tipl.checks.copies import RefitConfig, random_walks, run_like
 from tipl.checks.measures import (
-    NULL,
-    TOLERANCE,
     causality,
     equivariance,
     scale,
     skills,
 )
+from tipl.checks.model import refit_of
+from tipl.checks.results import NULL, TOLERANCE
 from tipl.errors import ForecastError, ModelError, TrainError
 from tipl.models.baselines import Ema
 from tipl.models.baselines.data import Trajectory

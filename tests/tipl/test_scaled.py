@@ -10,8 +10,8 @@ import pytest
 
 import weighttraj as wt
 from tests.tipl.lively import HORIZONS, lively_gate
-from tipl.checks import RefitConfig, refit_of
-from tipl.checks.copies import random_walks
+from tipl.checks.copies import RefitConfig, random_walks
+from tipl.checks.model import refit_of
 from tipl.errors import EvaluateError, ForecastError, ModelError, TrainError
 from tipl.evaluation.returns import Player
 from tipl.evaluation.starts import learning_phase

@@ -27,6 +27,7 @@ from tipl import (
     load,
     train,
 )
+from tipl.checks.results import read_checks
 from tipl.errors import EvaluateError, ForecastError, ModelError
 from tipl.evaluation.results import read_results
 from tipl.models.baselines import Extrapolation, Slope
@@ -177,10 +178,8 @@ def test_metrics_say_everything(trained: Path, zoo: Path, results: Path, checks:
     assert found.settings["rank"] == 8
     assert not {"out", "data", "runs"} & set(found.settings)
     assert [line["batch"] for line in found.log] == [20]
-    assert found.checks == json.loads(checks.read_text())
-    assert str(trained) not in (out / "metrics.json").read_text().replace(
-        found.checks["command"], ""
-    )
+    assert found.checks == read_checks(checks)
+    assert str(trained) not in (out / "metrics.json").read_text().replace(found.checks.command, "")
     line = listed("tipl-small")
     assert line[:4] == ("tipl-small", "tipl", "no", "small")
     assert "[" in line[4]  # an interval

@@ -6,11 +6,14 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from tipl.runs import weights_of
+from tipl.training import LoopConfig
+from tipl.training.starts import StartsConfig
 from weighttraj import ParamLayout, Run, RunWriter, open_run
 from weighttraj.format import DatasetInfo, RunEntry
 from weighttraj.store.catalog import write_dataset_info
@@ -18,28 +21,30 @@ from weighttraj.store.catalog import write_dataset_info
 Moments = tuple[Float32[np.ndarray, "time param"], Float32[np.ndarray, "time param"]]
 """First and second moments of Adam."""
 
+C = TypeVar("C", bound=StartsConfig)
+
 WALK = 300
 """Number of snapshots of a random walk."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefitConfig:
-    """How much a refit may cost."""
+    """How a forecaster is fitted to other runs."""
 
     folder: Path
-    """Data sets and models are written there."""
+    """Folder for data sets and models."""
     horizons: tuple[int, ...]
-    """How far the new forecaster must look, of those kinds that are fitted for some horizons."""
+    """Numbers of snapshots ahead."""
     batches: int = 2_000
-    """Batches, or gradient steps, of a network's training."""
+    """Number of batches, or gradient steps, of a network's training."""
     seed: int = 0
-    """Of samples and trainings."""
+    """Seed of samples and trainings."""
 
 
 def random_walks(
     run: Run, folder: Path, *, count: int = 4, length: int = WALK, seed: int = 0
 ) -> list[Run]:
-    """Runs whose steps are independent and normal: nothing in them can be forecast."""
+    """Write runs whose steps are independent and normal: nothing in them can be forecast."""
     walks = []
     for number in range(count):
         rng = np.random.default_rng([seed, number])
@@ -55,14 +60,14 @@ def run_like(
     folder: Path,
     moments: Moments | None = None,
 ) -> Run:
-    """A run on disk with other weights, of any length.
+    """Write a run with other weights, of any length; if it is there, only open it.
 
     Args:
-        run: its layout, cadence, counters and normalisers are copied; beyond its end the phases
-            go on and the rest stays as it was last.
-        weights: of the new run; float32 is stored.
-        folder: the new run is written there, named after its weights; if it is there, it is read.
-        moments: Adam's of the new run; None: noise, if the run has moments.
+        run: its layout, cadence, counters and normalisers are copied. Beyond its end the phases go
+            on, and the rest repeats the last snapshot.
+        weights: weights of the new run; float32 is stored.
+        folder: folder of the new run, which is named after its weights.
+        moments: Adam's moments of the new run; None: noise, if the run has moments.
     """
     stored = np.ascontiguousarray(weights, np.float32)
     if moments is None and run.info.optimizer_moments:
@@ -106,20 +111,14 @@ def run_like(
 
 
 def adam_of(run: Run) -> Moments | None:
-    """Adam's moments of a run, if it stores them."""
+    """Return Adam's moments of a run, if it stores them."""
     if not run.info.optimizer_moments:
         return None
     return run["optimizer/exp_avg"][:], run["optimizer/exp_avg_sq"][:]
 
 
 def as_dataset(runs: Sequence[Run], folder: Path, *, validation: int = 0) -> Path:
-    """A data set on disk of copies of these runs, for what is trained on one.
-
-    Args:
-        runs: for its training split.
-        folder: of the data set.
-        validation: so many of them, the last ones, are for the validation split.
-    """
+    """Write a data set of copies of these runs; the last ``validation`` ones are for validation."""
     copies = [run_like(run, weights_of(run), folder / "runs", adam_of(run)) for run in runs]
     train = len(copies) - validation
     entries = (
@@ -134,10 +133,31 @@ def as_dataset(runs: Sequence[Run], folder: Path, *, validation: int = 0) -> Pat
     return folder
 
 
+def refit_settings(
+    kind: type[C], training: LoopConfig, network: Any, runs: Sequence[Run], config: RefitConfig
+) -> C:
+    """Return the settings of a training of a network of these sizes on starts of other runs.
+
+    A quarter of the runs choose which state is kept.
+    """
+    training = replace(
+        training,
+        n_batches=config.batches,
+        save_every=max(1, config.batches // 20),
+        seed=config.seed,
+    )
+    return kind(
+        data=(as_dataset(runs, config.folder / "walks", validation=len(runs) // 4),),
+        out=config.folder / "refit",
+        network=replace(network, horizons=config.horizons, phases=0),
+        training=training,
+    )
+
+
 def random_symmetry(
     layout: ParamLayout, symmetry: str, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, " param"], Float32[np.ndarray, " param"]]:
-    """A symmetry of a policy's hidden units: ``weights[..., order] * signs`` acts as before.
+    """Draw a symmetry of a policy's hidden units: ``weights[..., order] * signs`` acts as before.
 
     Axes with the same ``hidden_*`` label are altered together.
     """
@@ -162,7 +182,7 @@ def random_symmetry(
 
 
 def _phases(known: Int[np.ndarray, " time"], length: int) -> Int[np.ndarray, " length"]:
-    """Phases of so many snapshots: the known ones, and then on and on."""
+    """Return the phases of so many snapshots: the known ones, then the same sequence on."""
     period = int(known.max()) + 1
     if period < 1 or length <= len(known):
         return np.resize(known, length)
@@ -171,7 +191,7 @@ def _phases(known: Int[np.ndarray, " time"], length: int) -> Int[np.ndarray, " l
 
 
 def _moments(run: Run, group: str) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Statistics of a normaliser at each snapshot."""
+    """Return the statistics of a normaliser at each snapshot."""
     mean, var, count = (run[f"{group}/{name}"][:] for name in ("mean", "var", "count"))
     rows = zip(mean, var, count.tolist(), strict=True)
     return [(np.asarray(m), np.asarray(v), n) for m, v, n in rows]

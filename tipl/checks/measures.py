@@ -1,20 +1,19 @@
 """Five tests that a causal forecaster should pass, as numbers.
 
-- *null*: fitted to random walks and scored on others, its skill is 0 at every horizon.
-- *causality*: what comes after t moves no bit of the forecast from t.
+- *null*: fitted to random walks and evaluated on others, its skill is 0 at every horizon.
+- *causality*: what comes after t changes no bit of the forecast from t.
 - *equivariance*: a policy with its hidden units in another order, or with the signs around tanh
   units flipped, is the same policy; the forecast follows.
 - *scale*: steps c times as long give a displacement c times as long.
 - *drift*: a run on a straight line is forecast exactly. Only trends must pass this one: a fit to
   runs that do not move on lines shrinks every step.
 
-The runs of the tests are real ones on disk (``copies``).
+The runs of the checks are real ones on disk (``copies``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from tipl.checks.copies import (
     random_walks,
     run_like,
 )
+from tipl.checks.results import Checks
 from tipl.errors import ForecastError, RepresentationError
 from tipl.forecaster import Forecaster
 from tipl.runs import weights_of
@@ -37,44 +37,8 @@ from weighttraj import Run
 Fit = Callable[[Sequence[Run]], Forecaster]
 """Fits a forecaster to runs."""
 
-NULL = 0.02
-"""Largest skill, up or down, that passes on random walks."""
-TOLERANCE = 1e-3
-"""Largest error, relative to the displacement, that passes. Float32 keeps a weight of 0.5 to 3e-8,
-a step of 1e-4 thus to 3e-4; sums in another order differ by less."""
 GRID = 2.0**-20
 """Weights of test runs are multiples of this, so that float32 holds sums and doubles exactly."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Checks:
-    """What the tests measured of one forecaster; ``passed`` compares it with limits."""
-
-    null: dict[int, float]
-    """Skill at each horizon on random walks."""
-    causality: bool
-    """Whether the forecast is the same to the last bit, whatever comes later."""
-    permutation: float
-    """Error after a permutation of hidden units, relative to the displacement."""
-    sign: float | None
-    """Error after a flip of signs; None: the policy has no odd units."""
-    scale: float
-    """Error after all steps were doubled."""
-    drift: float | None
-    """Error on a straight line; None: no forecast, since a line has fewer directions than a basis
-    needs."""
-
-    @property
-    def passed(self) -> dict[str, bool]:
-        """Verdict of each test."""
-        return {
-            "null": all(abs(skill) < NULL for skill in self.null.values()),
-            "causality": self.causality,
-            "permutation": self.permutation < TOLERANCE,
-            "sign": self.sign is None or self.sign < TOLERANCE,
-            "scale": self.scale < TOLERANCE,
-            "drift": self.drift is not None and self.drift < TOLERANCE,
-        }
 
 
 def check(
@@ -87,17 +51,17 @@ def check(
     count: int = 4,
     seed: int = 0,
 ) -> Checks:
-    """All five tests.
+    """Run all five checks.
 
     Args:
-        forecaster: what is tested, fitted to real runs.
-        run: a run of the kind that it was fitted to; the tests alter copies of it.
-        folder: the copies are written there.
+        forecaster: what is checked, fitted to real runs.
+        run: a run of the kind that it was fitted to; the checks alter copies of it.
+        folder: folder for the copies.
         fit: fits such a forecaster to runs, for the null; None: there is nothing to fit.
-            ``tipl.checks.refit_of`` returns it for every kind.
-        horizons: how far to look.
-        count: random walks for the null; two are forecast, the others are for the fit.
-        seed: of walks and symmetries.
+            ``tipl.checks.model.refit_of`` returns it for every kind.
+        horizons: numbers of snapshots ahead.
+        count: number of random walks for the null; two are forecast, the others are for the fit.
+        seed: seed of walks and symmetries.
 
     Raises:
         ForecastError: it makes no forecast of such runs, or for such horizons.
@@ -128,7 +92,7 @@ def check(
 def skills(
     forecaster: Forecaster, runs: Sequence[Run], horizons: Sequence[int]
 ) -> Float64[np.ndarray, " horizon"]:
-    """Skill at each horizon over all starts that have all horizons after them.
+    """Return the skill at each horizon over all starts that have all horizons after them.
 
     1 - sum |phi_{t+h} - forecast|^2 / sum |phi_{t+h} - phi_t|^2.
     """
@@ -148,7 +112,7 @@ def skills(
 def causality(
     forecaster: Forecaster, run: Run, folder: Path, start: int, horizons: Sequence[int]
 ) -> bool:
-    """Whether the forecast is the same to the last bit with another future, and with none."""
+    """Return whether the forecast is the same bits with another future, and with none."""
     weights, moments = weights_of(run), adam_of(run)
     rng = np.random.default_rng(0)
 
@@ -179,17 +143,10 @@ def equivariance(
     symmetry: str,
     seed: int = 0,
 ) -> float:
-    """Error of the forecast of a run with its hidden units altered, relative to the displacement.
+    """Return the error for a run with its hidden units altered, relative to the displacement.
 
-    Args:
-        forecaster: what is tested.
-        run: what is altered.
-        folder: the altered run is written there.
-        starts: where forecasts start.
-        horizons: how far to look.
-        symmetry: ``permutation`` of the units of each hidden layer, or ``sign``: a flip of the
-            weights into and out of some units, and of their biases.
-        seed: of the choice of units.
+    The symmetry is a ``permutation`` of the units of each hidden layer, or ``sign``: a flip of the
+    weights into and out of some units, and of their biases.
     """
     order, signs = random_symmetry(run.layout, symmetry, np.random.default_rng(seed))
     weights = weights_of(run)
@@ -212,7 +169,7 @@ def scale(
     *,
     factor: float = 2.0,
 ) -> float:
-    """Error of the displacement when all steps are longer, relative to the displacement."""
+    """Return the error of the displacement when all steps are longer, relative to it."""
     weights = _on_grid(weights_of(run))
     longer = weights[0] + factor * (weights - weights[0])
     moments = adam_of(run)
@@ -233,7 +190,7 @@ def drift(
     *,
     seed: int = 0,
 ) -> float:
-    """Error of the forecast of a run on a straight line, relative to the true displacement."""
+    """Return the error for a run on a straight line, relative to the true displacement."""
     first = _on_grid(weights_of(run)[0])
     step = _on_grid(np.random.default_rng(seed).normal(size=first.shape) * 1e-3)
     line = first + np.arange(max(starts) + 1)[:, None] * step
@@ -250,7 +207,7 @@ def _drift_or_none(*arguments: Any, seed: int) -> float | None:
 
 
 def _each(change: Callable[[np.ndarray], np.ndarray], moments: Moments | None) -> Any:
-    """Other moments: the length may be another."""
+    """Return changed moments; squares stay positive."""
     return None if moments is None else (change(moments[0]), np.abs(change(moments[1])))
 
 
@@ -259,7 +216,7 @@ def _on_grid(weights: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shap
 
 
 def _relative(error: np.ndarray, moved: np.ndarray) -> float:
-    """Norm of an error over that of a displacement; no error is 0 even where nothing moves."""
+    """Return the norm of an error over that of a displacement; 0 where both are 0."""
     if not error.any():
         return 0.0
     size = np.linalg.norm(np.asarray(moved, np.float64) * np.ones_like(error))

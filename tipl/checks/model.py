@@ -1,4 +1,4 @@
-"""Puts any forecaster to the five checks, with a fit of its kind to random walks for the null.
+"""Runs the five checks on any forecaster, with a fit of its kind to random walks for the null.
 
 A forecaster that was fitted to real runs does not show what its kind finds in random walks. So a
 new one, of the same kind and sizes, is fitted to walks. The registry says how; a kind without a
@@ -11,14 +11,14 @@ import sys
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import weighttraj as wt
 from tipl.checks.copies import RefitConfig
-from tipl.checks.measures import NULL, TOLERANCE, Fit, check
+from tipl.checks.measures import Fit, check
+from tipl.checks.results import CheckResults, Limits
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster
-from tipl.registry import kind_of
+from tipl.registry import imported, kinds
 from tipl.runs import cache_in
 from tipl.saved import fingerprint
 from tipl.settings import check_settings
@@ -26,10 +26,10 @@ from tipl.settings import check_settings
 
 def refit_of(forecaster: Forecaster, config: RefitConfig) -> Fit | None:
     """Return what fits such a forecaster to other runs; None: there is nothing to fit."""
-    kind = kind_of(forecaster)
+    kind = kinds().get(forecaster.kind)
     if kind is None or kind.refit is None:
         return None
-    refit = kind.refit_function()
+    refit = imported(kind.refit)
     return lambda runs: refit(forecaster, runs, config)
 
 
@@ -41,19 +41,10 @@ def check_model(
     batches: int = 2_000,
     walks: int = 12,
     seed: int = 0,
-) -> dict[str, Any]:
-    """All five checks on the first test run of a data set, as ``tipl check`` writes them.
+) -> CheckResults:
+    """Run the five checks on copies of the first test run of a data set, as ``tipl check`` does.
 
-    Args:
-        forecaster: what is checked.
-        data: a data set: path or id.
-        horizons: how far to look.
-        batches: of the training on random walks.
-        walks: random walks; two are forecast, the others are for the training.
-        seed: of walks, symmetries and the training.
-
-    Returns:
-        JSON: what was measured, how, and what passed.
+    The other arguments are described in ``CheckResults``.
 
     Raises:
         ForecastError: it makes no such forecast, or a number is too small or too large.
@@ -68,18 +59,18 @@ def check_model(
         config = RefitConfig(folder=folder, horizons=horizons, batches=batches, seed=seed)
         fit = refit_of(forecaster, config)
         found = check(forecaster, run, folder, fit=fit, horizons=horizons, count=walks, seed=seed)
-    return {
-        "forecaster": forecaster.name,
-        "fingerprint": fingerprint(forecaster),
-        "data": dataset.info.id,
-        "version": dataset.info.version,
-        "run": run.id,
-        "fitted_to_walks": fit is not None,
-        "batches": batches,
-        "walks": walks,
-        "seed": seed,
-        "largest": {"null": NULL, "error": TOLERANCE},
+    return CheckResults(
+        forecaster=forecaster.name,
+        fingerprint=fingerprint(forecaster),
+        data=dataset.info.id,
+        version=dataset.info.version,
+        run=run.id,
+        fitted_to_walks=fit is not None,
+        batches=batches,
+        walks=walks,
+        seed=seed,
+        largest=Limits(),
         **asdict(found),
-        "passed": found.passed,
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-    }
+        passed=found.passed,
+        command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+    )

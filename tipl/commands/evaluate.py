@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -15,11 +14,11 @@ from rich.table import Table
 
 from tipl.checks.model import check_model
 from tipl.evaluation.config import EvaluateConfig
-from tipl.evaluation.results import Results, read_results
+from tipl.evaluation.results import Results, read_results, write_document
 from tipl.registry import load
 from tipl.report import tables
-from tipl.report.evaluate import evaluate as evaluate_all
 from tipl.report.markdown import insert_markdown
+from tipl.report.page import evaluate as evaluate_all
 from tipl.report.page import write_report
 from tipl.report.tables import cell, headline, label
 from tipl.report.verdict import verdict
@@ -91,10 +90,9 @@ def check(
         walks=null_walks,
         seed=seed,
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    for name, passed in found["passed"].items():
-        say(f"{name}: {'passes' if passed else 'fails'}, {found[name]}")
+    write_document(out, found)
+    for name, passed in found.passed.items():
+        say(f"{name}: {'passes' if passed else 'fails'}, {getattr(found, name)}")
 
 
 def report(

@@ -22,28 +22,28 @@ class EvaluateConfig:
     split: Literal["train", "validation", "test"] = "test"
     """Split of the runs that forecasters are evaluated on."""
     horizons: tuple[int, ...] = HORIZONS
-    """Snapshots ahead; those beyond half of the shortest run are left out."""
+    """Numbers of snapshots ahead; those beyond half of the shortest run are left out."""
     starts: int = 2_000
-    """Starts in each run for errors of weights: the first moments, then evenly spaced."""
+    """Number of starts in each run for errors of weights: the first ones, then evenly spaced."""
     function_starts: int = 400
-    """Of these, starts for divergences of policies on stored observations; 0: none."""
+    """Number of these starts for divergences of policies on stored observations; 0: none."""
     return_horizons: tuple[int, ...] = (*range(1, 11), 20, 50, 100)
-    """Snapshots ahead for which returns are measured."""
+    """Numbers of snapshots ahead for which returns are measured."""
     learning_starts: int = 6
-    """Starts in each run's learning phase for returns; 0: no returns."""
+    """Number of starts in each run's learning phase for returns; 0: no returns."""
     plateau_starts: int = 3
-    """Starts after the learning phase for returns."""
+    """Number of starts after the learning phase for returns."""
     episodes: int = 20
-    """Episodes for the return of one policy, the same seeds for all."""
+    """Number of episodes for the return of one policy, the same seeds for all."""
     bootstrap: int = 2_000
-    """Resamples of the runs for intervals."""
+    """Number of resamples of the runs for intervals."""
     seed: int = 0
     """Seed of episodes and resamples."""
     quick: bool = False
     """Fewer starts, episodes and horizons: minutes instead of hours."""
 
     def bounded(self) -> EvaluateConfig:
-        """These settings, smaller if ``quick``.
+        """Return these settings, smaller if ``quick``.
 
         Raises:
             EvaluateError: a number is too small, or no horizon is named.

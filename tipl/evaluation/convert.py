@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from tipl.evaluation.results import Results, encoded
+from tipl.evaluation.results import Results, write_document
 
 RENAMED_SETTINGS = {"validate_every": "save_every"}
 """Settings of trainings that have another name now."""
@@ -37,7 +37,7 @@ def convert_file(file: Path) -> bool:
         return False
     typed = msgspec.convert(convert(results), Results)
     if not is_metrics:
-        file.write_text(encoded(typed), encoding="utf-8")
+        write_document(file, typed)
         return True
     renamed = {"judged_as": "evaluated_as"}
     document = {renamed.get(key, key): value for key, value in document.items()}
@@ -47,7 +47,7 @@ def convert_file(file: Path) -> bool:
         for old, new in RENAMED_SETTINGS.items():
             if old in part:
                 part[new] = part.pop(old)
-    file.write_text(encoded(document), encoding="utf-8")
+    write_document(file, document)
     return True
 
 

@@ -14,7 +14,7 @@ import weighttraj as wt
 from tipl.errors import EvaluateError
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.measure import Measured, Task, function_starts, measure
-from tipl.evaluation.results import Results, StartCounts, write_results
+from tipl.evaluation.results import Results, StartCounts, write_document
 from tipl.evaluation.returns import MODES
 from tipl.evaluation.starts import starts_of
 from tipl.evaluation.summary import Summary
@@ -25,43 +25,23 @@ from weighttraj.engine import Engine, engine_of
 from weighttraj.progress import LoggedProgress
 
 
-def evaluate(
+def evaluate_only(
     forecasters: Sequence[Forecaster],
     config: EvaluateConfig,
-    *,
-    workers: int = 1,
-    imports: Sequence[str] = (),
-    console: Console | None = None,
+    workers: int,
+    imports: Sequence[str],
+    console: Console,
 ) -> Results:
-    """Evaluate forecasters beside persistence, and write ``results.json``.
-
-    What was measured is kept in ``config.out``: the same call goes on where it stopped, and more
-    forecasters cost only their own measurements.
-
-    Args:
-        forecasters: what is evaluated; persistence is added, and the oracle of each TIPL's rank.
-        config: on what, and how much.
-        workers: number of processes; 1 means this one.
-        imports: modules that register environments; every worker imports them.
-        console: where progress is shown; None: nowhere.
-
-    Returns:
-        What ``results.json`` holds.
-
-    Raises:
-        EvaluateError: the runs do not fit together, are too short, or have no returns, or two
-            forecasters have one name.
-        KeyboardInterrupt: it was stopped; what was measured stays.
-    """
+    """Evaluate forecasters, and write ``results.json``; ``tipl.evaluate`` writes a page, too."""
     config, everyone = config.bounded(), _everyone(forecasters)
     dataset = wt.open_dataset(config.data)
     runs, left_out = _whole_runs(dataset.split(config.split).runs, config)
     _check_runs(runs, config)
     config = _within(config, min(len(run) for run in runs) // 2)
     tasks = [Task(path=run.path.absolute(), forecasters=everyone, config=config) for run in runs]
-    starts_of(runs[0], config)  # what is too short or has no returns is refused before the work
+    starts_of(runs[0], config)  # refuses what is too short or has no returns before the work
     with engine_of(workers, imports=imports) as engine:
-        measured = _measure(tasks, engine, console or Console(quiet=True))
+        measured = _measure(tasks, engine, console)
     summary = Summary(measured, config, everyone[0].name)
     results = Results(
         data=dataset.info.id,
@@ -76,22 +56,22 @@ def evaluate(
         episodes=config.episodes,
         seed=config.seed,
         quick=config.quick,
-        starts=_counts(measured),
+        starts=StartCounts(
+            weights=sum(len(m.starts.weights) for m in measured),
+            policies=sum(len(m.function_starts) for m in measured),
+            learning=sum(len(m.starts.learning) for m in measured),
+            plateau=sum(len(m.starts.plateau) for m in measured),
+        ),
         noise_floor=summary.noise() if config.learning_starts else {},
         forecasters={forecaster.name: summary.of(forecaster) for forecaster in everyone},
         command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     )
-    write_results(config.out / "results.json", results)
+    write_document(config.out / "results.json", results)
     return results
 
 
 def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
-    """Return what is evaluated: persistence, the forecasters, and their oracles.
-
-    Raises:
-        ForecastError: an object does not follow the protocol.
-        EvaluateError: two of them have one name.
-    """
+    """Return what is evaluated: persistence, the forecasters, and their oracles."""
     for forecaster in forecasters:
         check_forecaster(forecaster)
     persistence = load("persistence")
@@ -101,18 +81,20 @@ def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
         *(f for f in forecasters if f.name != persistence.name),
         *(oracles[name] for name in sorted(oracles)),
     )
-    _check_names(everyone)
+    names = [f.name for f in everyone]
+    if len(set(names)) < len(names):
+        raise EvaluateError(
+            "two forecasters have the same name",
+            got=names,
+            do="a model is named after its folder: rename one",
+        )
     return everyone
 
 
 def _whole_runs(
     runs: Sequence[wt.Run], config: EvaluateConfig
 ) -> tuple[list[wt.Run], dict[str, str]]:
-    """Leave out runs that nothing can be evaluated on, and say why.
-
-    Raises:
-        EvaluateError: no run is left.
-    """
+    """Leave out runs that nothing can be evaluated on, and say why."""
     kept, faults = without_faults(runs, lambda run: fault_of(weights_of(run)))
     if not kept:
         raise EvaluateError(
@@ -135,15 +117,6 @@ def _within(config: EvaluateConfig, half: int) -> EvaluateConfig:
     )
 
 
-def _counts(measured: Sequence[Measured]) -> StartCounts:
-    return StartCounts(
-        weights=sum(len(m.starts.weights) for m in measured),
-        policies=sum(len(m.function_starts) for m in measured),
-        learning=sum(len(m.starts.learning) for m in measured),
-        plateau=sum(len(m.starts.plateau) for m in measured),
-    )
-
-
 def _up_to(half: int, horizons: Sequence[int], option: str) -> tuple[int, ...]:
     found = tuple(h for h in horizons if h <= half)
     if not found:
@@ -157,7 +130,7 @@ def _up_to(half: int, horizons: Sequence[int], option: str) -> tuple[int, ...]:
 
 
 def _env_steps_of(run: wt.Run) -> float:
-    """Environment steps from one snapshot to the next, a mean over the run."""
+    """Return the mean number of environment steps from one snapshot to the next."""
     first, last = (int(run["index/num_timesteps"][i]) for i in (0, -1))
     return (last - first) / (len(run) - 1)
 
@@ -178,16 +151,6 @@ def _check_runs(runs: Sequence[wt.Run], config: EvaluateConfig) -> None:
             expected="probe observations",
             where=config.data,
             do="collect with probe_observations, or give --function-starts 0",
-        )
-
-
-def _check_names(forecasters: Sequence[Forecaster]) -> None:
-    names = [f.name for f in forecasters]
-    if len(set(names)) < len(names):
-        raise EvaluateError(
-            "two forecasters have the same name",
-            got=names,
-            do="a model is named after its folder: rename one",
         )
 
 
@@ -217,7 +180,7 @@ def _measure(tasks: Sequence[Task], engine: Engine, console: Console) -> list[Me
 
 
 def _totals(tasks: Sequence[Task]) -> dict[str, int]:
-    """How much there is to do: starts for weights and policies, policies for returns."""
+    """Return how much there is to do: starts for weights and policies, policies for returns."""
     totals = {"weights": 0, "policies": 0, "returns": 0}
     for task in tasks:
         config, n = task.config, len(task.forecasters)

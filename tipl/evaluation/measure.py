@@ -28,9 +28,9 @@ class Task:
     path: Place
     """The run."""
     forecasters: tuple[Forecaster, ...]
-    """What is evaluated; the first one is persistence."""
+    """The forecasters; the first one is persistence."""
     config: EvaluateConfig
-    """How."""
+    """What is measured, and how much of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Measured:
     """What was measured on one run."""
 
     run: str
-    """Its id."""
+    """Id of the run."""
     starts: Starts
     """Where forecasts started."""
     boundary: np.ndarray
@@ -46,9 +46,9 @@ class Measured:
     function_starts: np.ndarray
     """int (start,): the starts for divergences."""
     function_boundary: np.ndarray
-    """bool (start,): the same of these."""
+    """bool (start,): ``boundary`` of these starts."""
     tensors: np.ndarray
-    """int (tensor,): parameters of each."""
+    """int (tensor,): number of parameters of each."""
     weights: dict[str, Arrays]
     """``squared`` by forecaster."""
     functions: dict[str, Arrays]
@@ -60,16 +60,16 @@ class Measured:
 
 
 def measure(task: Task, tell: Tell) -> Measured:
-    """Measure what is not there yet.
+    """Measure what is not stored yet.
 
-    ``tell`` hears what was done ("weights", "policies" or "returns"), and how much of it.
+    ``tell`` is called with what was done ("weights", "policies" or "returns") and how much of it.
     """
     with threads(), _Measurement(task, tell) as measurement:
         return measurement.all()
 
 
 def function_starts(starts: Starts, config: EvaluateConfig) -> np.ndarray:
-    """Some of the starts for weights, evenly."""
+    """Return some of the starts for weights, evenly spaced."""
     count = min(config.function_starts, len(starts.weights))
     chosen = np.linspace(0, len(starts.weights) - 1, count).round().astype(int)
     return np.asarray(starts.weights[np.unique(chosen)])
@@ -87,7 +87,7 @@ class _Measurement(contextlib.ExitStack):
         self._players: dict[int, Player] = {}
 
     def all(self) -> Measured:
-        """Everything."""
+        """Measure everything."""
         starts, config = self._starts, self._config
         chosen = function_starts(starts, config)
         weights, functions = {}, {}
@@ -138,7 +138,7 @@ class _Measurement(contextlib.ExitStack):
         function: Callable[[Tick], Arrays],
         work: tuple[str, int],
     ) -> Arrays:
-        """Arrays that are there, or are made now; tells of so much work in either case."""
+        """Return stored arrays, or measure them now; report the same work in both cases."""
         what, count = work
         done: list[int] = []
 

@@ -1,4 +1,4 @@
-"""What was measured of a forecaster on a run: kept on disk, so that it is measured once."""
+"""Measurements of a forecaster on a run, kept on disk so that each is made once."""
 
 from __future__ import annotations
 
@@ -18,22 +18,18 @@ Arrays = dict[str, np.ndarray]
 
 
 class Parts:
-    """A folder of measurements. Each says what it was made from; what no longer fits is made again.
-
-    Args:
-        folder: it.
-    """
+    """A folder of measurements. Each names its sources, and is made again when these change."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def get(self, name: str, source: dict[str, Any], measure: Callable[[], Arrays]) -> Arrays:
-        """The arrays of a measurement, made if they are not there.
+        """Return the arrays of a measurement; make them if they are not stored.
 
         Args:
             name: path in the folder, without suffix.
-            source: JSON of all that the arrays depend on.
-            measure: makes them.
+            source: everything that the arrays depend on, for JSON.
+            measure: makes the arrays.
         """
         path = self._folder / f"{name}.npz"
         wanted = json.dumps(source, sort_keys=True, default=str)
@@ -44,7 +40,7 @@ class Parts:
 
 
 def run_source(run: Run) -> dict[str, Any]:
-    """Return what tells a run from any other."""
+    """Return what identifies a run."""
     return {"run": run.id, "digest": checksum_of(run)}
 
 

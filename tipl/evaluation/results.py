@@ -154,12 +154,8 @@ def read_results(file: Path) -> Results:
         ) from error
 
 
-def write_results(file: Path, results: Results) -> None:
-    """Write a result file."""
+def write_document(file: Path, document: Any) -> None:
+    """Write a document as indented JSON."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(encoded(results), encoding="utf-8")
-
-
-def encoded(document: Any) -> str:
-    """Return a document as JSON text."""
-    return msgspec.json.format(msgspec.json.encode(document), indent=1).decode() + "\n"
+    text = msgspec.json.format(msgspec.json.encode(document), indent=1)
+    file.write_bytes(text + b"\n")

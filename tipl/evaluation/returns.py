@@ -15,20 +15,20 @@ from weighttraj import Run
 from weighttraj.policies import Evaluator, PolicyBatch, env_of, load_policies
 
 MODES = ("sampled", "held", "deterministic")
-"""How policies act: samples; samples with the exploration noise ``log_std`` of the start, in every
-arm; the distribution's mode."""
+"""How policies act: by samples; by samples with the exploration noise ``log_std`` of the start; by
+the distribution's mode."""
 FRESH = 10_000
-"""Added to the seeds of episodes that only serve to measure how noisy a return is."""
+"""Offset of the seeds of the episodes that measure how noisy a return is."""
 
 
 class Player:
-    """Mean returns of policies of one run; equal policies play once.
+    """Measures mean returns of policies of one run; equal policies play once.
 
     Args:
         run: the run.
-        episodes: for each policy, the same seeds for all.
-        seed: of the first.
-        modes: how they act, of ``MODES``.
+        episodes: number of episodes of each policy, the same seeds for all.
+        seed: seed of the first episode.
+        modes: how policies act, of ``MODES``.
     """
 
     def __init__(self, run: Run, episodes: int, seed: int, *, modes: Sequence[str] = MODES) -> None:
@@ -48,12 +48,12 @@ class Player:
         starts: Int[np.ndarray, " policy"],
         tick: Tick = lambda _: None,
     ) -> Float[np.ndarray, "mode policy"]:
-        """Mean returns in each mode.
+        """Return the mean returns in each mode.
 
         Args:
-            policies: to be played.
-            starts: the snapshot whose ``log_std`` each has in the mode ``held``.
-            tick: called with a number of policies that have played.
+            policies: the policies.
+            starts: the snapshot whose ``log_std`` each policy has in the mode ``held``.
+            tick: progress callback, called with a number of policies.
         """
         held = policies.with_weights(hold_log_std(self._run, policies.weights, starts))
         arms = {"sampled": policies, "held": held, "deterministic": policies}
@@ -76,7 +76,7 @@ class Player:
 def true_returns(
     player: Player, run: Run, starts: Int[np.ndarray, " start"], horizons: Sequence[int], tick: Tick
 ) -> Arrays:
-    """Returns of the policies at the starts, and of those that training made of them.
+    """Return the returns of the policies at the starts, and of their true successors.
 
     Returns:
         ``now``: float64 (mode, start); ``later``: (mode, start, horizon).
@@ -95,10 +95,10 @@ def forecast_returns(
     horizons: Sequence[int],
     tick: Tick,
 ) -> Arrays:
-    """Returns of forecast policies.
+    """Return the returns of forecast policies.
 
-    They act with the normaliser of the start: the later one is the future's. An oracle, which is
-    no forecast, acts with the later one.
+    They act with the normaliser of the start, because the later one is not known yet. An oracle,
+    which is no forecast, acts with the later one.
 
     Returns:
         ``forecast``: float64 (mode, start, horizon).
@@ -114,7 +114,7 @@ def forecast_returns(
 def hold_log_std(
     run: Run, weights: Float32[np.ndarray, "policy param"], starts: Int[np.ndarray, " policy"]
 ) -> Float32[np.ndarray, "policy param"]:
-    """The weights with the exploration noise of other snapshots of the run."""
+    """Return the weights with the exploration noise of other snapshots of the run."""
     names = [param.name for param in run.layout.params]
     if "log_std" not in names:
         return weights
@@ -125,6 +125,6 @@ def hold_log_std(
 
 
 def _keys(policies: PolicyBatch) -> list[bytes]:
-    """What tells one policy from another: its weights and its normaliser."""
+    """Return the bytes that identify each policy: its weights and its normaliser."""
     parts = [x for x in (policies.weights, policies.mean, policies.var) if x is not None]
     return [b"".join([part[row].tobytes() for part in parts]) for row in range(len(policies))]

@@ -1,4 +1,4 @@
-"""From where forecasts start: all moments for weights, the learning phase for returns."""
+"""Where forecasts start: at all snapshots for weights, in the learning phase for returns."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from weighttraj import Run
 LEARNED = 0.95
 """Share of the way from the first to the final return at which the learning phase ends."""
 DENSE = 64
-"""First moments of a run that are always among the starts: the longest steps are there, and a sum
-over starts hangs on a few of them."""
+"""Number of first snapshots that are always starts: the longest steps are there, and a few of them
+dominate a sum over starts."""
 _HISTORY = 10
-"""Snapshots that a forecast of returns may look back on, at least."""
+"""Number of snapshots that a start for returns should have before it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Starts:
-    """Where forecasts of one run start, and how far they go."""
+    """Where forecasts of one run start."""
 
     weights: Int[np.ndarray, " start"]
-    """For errors of weights: each has all horizons after it."""
+    """Starts for errors of weights; the run goes on for every horizon."""
     learning: Int[np.ndarray, " learning_start"]
-    """For returns, within the learning phase."""
+    """Starts for returns within the learning phase."""
     plateau: Int[np.ndarray, " plateau_start"]
-    """For returns, after it."""
+    """Starts for returns after it."""
 
 
 def starts_of(run: Run, config: EvaluateConfig) -> Starts:
-    """The starts of a run.
+    """Return the starts of a run.
 
     Raises:
         EvaluateError: the run is too short, or it has no returns that tell when it has learned.
@@ -62,10 +62,10 @@ def starts_of(run: Run, config: EvaluateConfig) -> Starts:
 
 
 def learning_phase(run: Run) -> int:
-    """The first snapshot whose return has come 95 % of the way from the first to the final one.
+    """Return the first snapshot whose return is 95 % of the way from the first to the final one.
 
-    The final return is the median over the last quarter of what was evaluated. Sampled actions,
-    if they are stored: deterministic returns can jump.
+    The final return is the median over the last quarter of the evaluated snapshots. Returns of
+    sampled actions are used if they are stored, because deterministic ones can jump.
 
     Raises:
         EvaluateError: the run has no returns.
@@ -85,20 +85,20 @@ def learning_phase(run: Run) -> int:
 
 
 def at_boundary(run: Run, starts: Int[np.ndarray, " start"]) -> Bool[np.ndarray, " start"]:
-    """Whether the step after a start belongs to the next iteration: new data arrive before it."""
+    """Return whether the step after each start belongs to the next iteration, with new data."""
     iteration = run.iteration
     return np.asarray(iteration[starts + 1] != iteration[starts])
 
 
 def shares(starts: Int[np.ndarray, " start"]) -> Float[np.ndarray, " start"]:
-    """How many moments of a run each start stands for: those that are nearest to it."""
+    """Return the number of snapshots that each start stands for: those nearest to it."""
     middles = (starts[1:] + starts[:-1]) / 2
     edges = np.concatenate([starts[:1] - 0.5, middles, starts[-1:] + 0.5])
     return np.asarray(np.diff(edges))
 
 
 def _sample(last: int, count: int) -> Int[np.ndarray, " start"]:
-    """All moments up to the last; if fewer are asked for, the first ones, then evenly spaced."""
+    """Return all snapshots up to the last, or the first ones and then evenly spaced ones."""
     if count > last:
         return np.arange(last + 1)
     dense = min(DENSE, count // 4)
@@ -106,5 +106,5 @@ def _sample(last: int, count: int) -> Int[np.ndarray, " start"]:
 
 
 def _spread(first: int, last: int, count: int) -> Int[np.ndarray, " start"]:
-    """So many integers, evenly from the first to the last."""
+    """Return ``count`` integers, evenly spaced from the first to the last."""
     return np.unique(np.linspace(first, last, min(count, last - first + 1)).round().astype(int))

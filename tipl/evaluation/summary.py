@@ -1,4 +1,4 @@
-"""From what was measured on each run to the figures that are reported."""
+"""From measurements on each run to the figures that are reported."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from tipl.forecaster import Forecaster
 from tipl.saved import fingerprint
 
 KINDS = ("all", "within", "boundary")
-"""Starts: all; those whose next step stays in the iteration; those whose next step leaves it."""
+"""Kinds of starts: all; next step within the iteration; next step in a new one."""
 AGGREGATES = ("ratio_of_sums", "mean_of_ratios", "tensors_equal")
-"""Skill: of the summed errors; the mean over starts of each one's; the mean over tensors."""
+"""Skills: of the summed errors; mean over the starts' own skills; mean over tensors."""
 PHASES = ("learning", "plateau")
 NEAR = 10
 """The paper's horizons end here."""
@@ -38,13 +38,7 @@ Shares = Float[np.ndarray, " _start"]
 
 
 class Summary:
-    """Figures of forecasters over runs.
-
-    Args:
-        measured: what was measured, run by run.
-        config: how.
-        persistence: name of the forecaster that every other is compared with.
-    """
+    """Figures of forecasters over runs, beside those of the forecaster named ``persistence``."""
 
     def __init__(
         self, measured: Sequence[Measured], config: EvaluateConfig, persistence: str
@@ -70,7 +64,7 @@ class Summary:
         )
 
     def noise(self) -> dict[str, float]:
-        """Mean difference between a true policy's returns over two sets of episodes, by mode."""
+        """Return the mean difference of true returns over two sets of episodes, by mode."""
         gaps = [np.abs(m.true["later"][:, :, :1] - m.true["fresh"]) for m in self._measured]
         each = np.concatenate(gaps, axis=1).mean((1, 2))
         return dict(zip(MODES, each.tolist(), strict=True))
@@ -102,7 +96,7 @@ class Summary:
     def _by_kind(
         self, aggregate: str, runs: Sequence[tuple[Errors, Errors, Chosen, Shares]]
     ) -> dict[str, Rows]:
-        """A skill over each kind of start, of runs that may have different starts."""
+        """Return a skill over each kind of start; runs may have different starts."""
         found = {}
         for kind in KINDS:
             each = [
@@ -124,7 +118,7 @@ class Summary:
         return self._rows(self._config.horizons, self._bootstrap.interval(mean, np.stack(each)))
 
     def _repw(self, name: str) -> dict[str, dict[str, Rows]]:
-        """|J(true) - J(forecast)|, means over the starts of each run."""
+        """Return |J(true) - J(forecast)|, means over the starts of each run."""
         horizons = self._config.return_horizons
         return {
             mode: {
@@ -137,9 +131,9 @@ class Summary:
         }
 
     def _repw_ratio(self, name: str) -> dict[str, Interval]:
-        """REPW over that of persistence in the learning phase, summed over the paper's horizons.
+        """Return REPW over persistence's while learning, summed over the paper's horizons.
 
-        Paired: an interval draws a run with its errors of both.
+        The interval is paired: it draws a run with the errors of both.
         """
         near = [i for i, h in enumerate(self._config.return_horizons) if h <= NEAR]
         found = {}
@@ -153,12 +147,12 @@ class Summary:
         return found
 
     def _gaps(self, name: str, mode: int, phase: str) -> Float[np.ndarray, "run horizon"]:
-        """REPW of each run: a mean over its starts, NaN where it has none."""
+        """Return REPW of each run: a mean over its starts, NaN where it has none."""
         arms = self._arms(name, mode, phase)
         return np.stack([_mean(np.abs(later - forecast)) for _, later, forecast in arms])
 
     def _gain(self, name: str) -> dict[str, tuple[GainRow, ...]]:
-        """What a forecast earns of what training earns, over the learning phase."""
+        """Return what a forecast earns of what training earns, over the learning phase."""
         found = {}
         for i, mode in enumerate(MODES):
             arms = list(self._arms(name, i, "learning"))
@@ -185,8 +179,8 @@ class Summary:
         return found
 
     def _scatter(self, name: str) -> dict[str, tuple[Points, ...]]:
-        """Returns of true and forecast policies, for the paper's horizons."""
-        near = [i for i, h in enumerate(self._config.return_horizons) if h <= 10]
+        """Return the returns of true and forecast policies, for the paper's horizons."""
+        near = [i for i, h in enumerate(self._config.return_horizons) if h <= NEAR]
         return {
             mode: tuple(
                 Points(
@@ -203,7 +197,7 @@ class Summary:
         }
 
     def _arms(self, name: str, mode: int, phase: str) -> Any:
-        """Returns now (start,), later and of the forecast (start, horizon), run by run."""
+        """Yield each run's returns: now (start,); later and forecast (start, horizon)."""
         for m in self._measured:
             n = len(m.starts.learning)
             part = slice(None, n) if phase == "learning" else slice(n, None)
@@ -219,13 +213,9 @@ def _of_kind(kind: str, boundary: Chosen) -> Chosen:
 
 
 def _summed(aggregate: str, error: Errors, copy: Errors, share: Shares) -> tuple[Any, ...]:
-    """What a skill is computed from, of one run, so that runs can be drawn.
+    """Return what a skill is computed from, for one run, so that runs can be drawn.
 
-    Args:
-        aggregate: which skill.
-        error: of the forecasts.
-        copy: errors of persistence.
-        share: how much each start counts; 0: it is left out.
+    ``copy`` are the errors of persistence; a start with a share of 0 is left out.
     """
     if aggregate == "mean_of_ratios":
         ratios = 1 - quotient(error.sum(2), copy.sum(2))
@@ -256,5 +246,5 @@ _SKILLS: dict[str, Callable[..., np.ndarray]] = {
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis; NaN where there is nothing."""
+    """Return the mean over the first axis; NaN if it is empty."""
     return mean(values) if len(values) else np.full(values.shape[1:], np.nan)

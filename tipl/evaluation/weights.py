@@ -1,4 +1,4 @@
-"""How far forecast weights are from the true ones, and how far the policies that they make."""
+"""Errors of forecast weights, and divergences of the policies that they make."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from weighttraj import Run
 from weighttraj.policies import PolicyBatch, load_policies
 
 MAX_BYTES = 2**27
-"""Memory for the forecasts of one chunk of starts."""
+"""Bytes of the forecasts of one chunk of starts."""
 
 Tick = Callable[[int], None]
-"""Called with a number of starts that are done."""
+"""Progress callback, called with a number of starts."""
 
 
 def squared_errors(
@@ -29,7 +29,7 @@ def squared_errors(
     horizons: Sequence[int],
     tick: Tick,
 ) -> Arrays:
-    """Sums of squared errors of the weights.
+    """Return sums of squared errors of the weights.
 
     Returns:
         ``squared``: float64 (start, horizon, tensor), a sum for each tensor of the layout.
@@ -51,10 +51,10 @@ def divergences(
     horizons: Sequence[int],
     tick: Tick,
 ) -> Arrays:
-    """Divergence of forecast policies from the true ones: KL(pi_{t+h} || pi~_{t+h}).
+    """Return the divergence of forecast policies from the true ones: KL(pi_{t+h} || pi~_{t+h}).
 
-    On network inputs that were stored of the rollout after which pi_{t+h} was made. Normalisers
-    don't enter: both policies see the same inputs.
+    Both see the same network inputs, which were stored from the rollout that precedes pi_{t+h}; so
+    normalisers play no part.
 
     Returns:
         ``kl``: float64 (start, horizon), means over observations.
@@ -90,7 +90,7 @@ def _forecasts(
     horizons: Sequence[int],
     room: int,
 ) -> Iterator[tuple[Int[np.ndarray, " start"], Float32[np.ndarray, "start horizon param"]]]:
-    """Forecasts, in chunks that memory holds when each takes so many numbers."""
+    """Yield forecasts in chunks of starts; ``room`` is how many numbers one forecast takes."""
     size = max(1, MAX_BYTES // (room * len(horizons) * 4))
     for first in range(0, len(starts), size):
         chunk = starts[first : first + size]
@@ -100,7 +100,7 @@ def _forecasts(
 def _later(
     weights: Any, starts: Int[np.ndarray, " start"], horizons: Sequence[int]
 ) -> Float32[np.ndarray, "start horizon param"]:
-    """The true weights; rows that several starts need are read once."""
+    """Return the true weights; rows that several starts need are read once."""
     rows = starts[:, None] + np.asarray(horizons)
     wanted, place = np.unique(rows, return_inverse=True)
     return np.asarray(weights[wanted])[place.reshape(rows.shape)]

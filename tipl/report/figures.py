@@ -1,7 +1,7 @@
 """Results as pictures.
 
-A few forecasters have colours: the models, persistence and the best baselines. The others are grey,
-so that twenty of them leave a picture that can be read. Oracles are dashed.
+The models, persistence and the best baselines have colours, the other baselines are grey, and
+oracles are dashed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tipl.evaluation.results import GainRow, Results, Row
+from tipl.evaluation.results import GainRow, Measure, Results, Row
 from tipl.report.scores import (
     PERSISTENCE,
     SKILL,
     function_skill,
+    gain,
     models,
     oracles,
     repw,
@@ -30,30 +31,32 @@ from tipl.report.scores import (
 )
 from tipl.report.tables import MODE_NAMES, label
 
+SIZE = (12, 4.6)
+"""Width and height of a figure, in inches."""
 OTHERS = "other baselines"
-"""Their entry in legends."""
+"""Entry of the grey ones in legends."""
 _OF_MODELS = ("#c0392b", "#e67e22", "#8e44ad", "#d6529e")
 _OF_BASELINES = ("#2471a3", "#17a589", "#7d6608", "#5dade2")
 _BLACK, _GREY = "#1c1c1c", "#a6acaf"
 _LOWEST = -0.5
-"""Skills and gains below are cut off."""
+"""Smallest skill and gain that is drawn."""
 
 Style = dict[str, Any]
-"""Of a line, as ``Axes.plot`` takes it."""
+"""Style of a line, as ``Axes.plot`` takes it."""
 
 
 def figures(results: Results) -> dict[str, Figure]:
-    """All figures of a page, by title."""
+    """Return all figures of a page, by title."""
     return {title: draw() for title, draw in _plans(results).items()}
 
 
 def titles(results: Results) -> list[str]:
-    """Of all figures of a page; nothing is drawn."""
+    """Return the titles of all figures of a page; nothing is drawn."""
     return list(_plans(results))
 
 
 def file_name(title: str) -> str:
-    """What the picture of this title is called on disk."""
+    """Return the file name of the picture of this title."""
     return title.lower().replace("'", "").replace(",", "").replace(" ", "-") + ".png"
 
 
@@ -71,49 +74,46 @@ def _plans(results: Results) -> dict[str, Callable[[], Figure]]:
 
 
 def skill_figure(results: Results) -> Figure:
-    """Skill in weights, all starts and at boundaries, and in function."""
-    fig = Figure(figsize=(12, 4.6), layout="constrained")
-    panels = [
-        ("weights, all starts", SKILL),
-        ("weights, next step in a new iteration", skill(starts="boundary")),
-        ("policies (divergence)", function_skill),
-    ]
-    all_axes = fig.subplots(1, 3, sharey=True)
-    for axes, (title, measure) in zip(all_axes, panels, strict=True):
-        for name, style in styles(results).items():
-            _draw_band(axes, measure(results.forecasters[name]), style)
-        axes.set_xscale("log")
-        axes.set_ylim(_LOWEST, 1)
-        _name_those_below(axes)
-        axes.set_title(title, fontsize=10)
-        _label(axes, "horizon h, snapshots", "skill" if axes is all_axes[0] else "")
-    _legend(fig)
-    return fig
+    """Return the skill in weights, all starts and at boundaries, and in function."""
+    panels = {
+        "weights, all starts": SKILL,
+        "weights, next step in a new iteration": skill(starts="boundary"),
+        "policies (divergence)": function_skill,
+    }
+    return _bands(results, panels, "skill", top=1)
 
 
 def gain_figure(results: Results) -> Figure:
-    """What a forecast earns of what training earns, in each action mode."""
-    fig = Figure(figsize=(12, 4.6), layout="constrained")
-    all_axes = fig.subplots(1, 3, sharey=True)
-    for axes, mode in zip(all_axes, results.modes, strict=True):
-        for name, style in styles(results).items():
-            _draw_band(axes, results.forecasters[name].gain.get(mode, ()), style)
+    """Return what a forecast earns of what training earns, in each action mode."""
+    panels = {MODE_NAMES[mode]: gain(mode) for mode in results.modes}
+    fig = _bands(results, panels, "inference gain", top=1.2)
+    for axes in fig.axes:
         axes.axhline(1, ls=":", color="black", lw=1)
+    return fig
+
+
+def _bands(results: Results, panels: dict[str, Measure], y: str, top: float) -> Figure:
+    """Draw a measure against the horizon in each panel, every forecaster with its interval."""
+    fig = Figure(figsize=SIZE, layout="constrained")
+    all_axes = fig.subplots(1, len(panels), sharey=True)
+    for axes, (title, measure) in zip(all_axes, panels.items(), strict=True):
+        for name, style in styles(results).items():
+            _draw_band(axes, measure(results.forecasters[name]), style)
         axes.set_xscale("log")
-        axes.set_ylim(_LOWEST, 1.2)
+        axes.set_ylim(_LOWEST, top)
         _name_those_below(axes)
-        axes.set_title(MODE_NAMES[mode], fontsize=10)
-        _label(axes, "horizon h, snapshots", "inference gain" if axes is all_axes[0] else "")
+        axes.set_title(title, fontsize=10)
+        _label(axes, "horizon h, snapshots", y if axes is all_axes[0] else "")
     _legend(fig)
     return fig
 
 
 def return_figure(results: Results) -> Figure:
-    """Returns of forecast policies beside the environment steps that PPO takes instead.
+    """Return returns of forecast policies beside the environment steps that PPO takes instead.
 
     Interquartile means over starts in the learning phase of all runs. A forecast takes no step.
     """
-    fig = Figure(figsize=(12, 4.6), layout="constrained")
+    fig = Figure(figsize=SIZE, layout="constrained")
     all_axes = fig.subplots(1, 3, sharey=True)
     each = results.env_steps_per_snapshot
     for axes, mode in zip(all_axes, results.modes, strict=True):
@@ -148,7 +148,7 @@ def paper_figure(results: Results, mode: str) -> Figure:
     Left: WPE and REPW against the forecast step. Right: return of the true policy against the
     return of the forecast policy, over all steps, of those that have a colour.
     """
-    fig = Figure(figsize=(12, 4.6), layout="constrained")
+    fig = Figure(figsize=SIZE, layout="constrained")
     errors, returns, scatter = fig.subplots(1, 3)
     coloured = shown(results)
     for name, style in styles(results).items():
@@ -172,7 +172,7 @@ def paper_figure(results: Results, mode: str) -> Figure:
 
 
 def styles(results: Results) -> dict[str, Style]:
-    """How each forecaster is drawn."""
+    """Return how each forecaster is drawn."""
     coloured, ours, dashed = shown(results), models(results), oracles(results)
     rivals = [name for name in coloured if name not in (*ours, PERSISTENCE)]
     colors = dict(zip(ours, _cycle(_OF_MODELS, len(ours)), strict=True))
@@ -211,7 +211,7 @@ def _draw_band(axes: Axes, rows: Sequence[Row], style: Style) -> None:
 
 
 def _name_those_below(axes: Axes) -> None:
-    """Lines with a colour that are cut off as a whole."""
+    """Name the lines with a colour that lie below the frame."""
     heights = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.get_lines()}
     below = [text for text, y in heights.items() if text != OTHERS and y.max() < _LOWEST]
     if below:
@@ -226,7 +226,7 @@ def _label(axes: Axes, x: str, y: str) -> None:
 
 
 def _legend(fig: Figure) -> None:
-    """One entry for each label of any panel; those without a colour come last."""
+    """Draw one entry for each label of any panel; those without a colour come last."""
     entries = {
         text: handle
         for axes in fig.axes
@@ -240,7 +240,7 @@ def _legend(fig: Figure) -> None:
 
 
 def svg(fig: Figure) -> str:
-    """The figure as text that can stand inside a page; the same bytes for the same figure."""
+    """Return the figure as text for a page; the same bytes for the same figure."""
     buffer = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "weighttraj"}):
         fig.savefig(buffer, format="svg", metadata={"Date": None})

@@ -2,8 +2,8 @@
 
 A place begins with ``<!-- results of FILE, SECTION: rewrite with ... -->`` and ends with
 ``<!-- end of results -->``, a line each; what follows a colon is for readers. Without a section it
-shows the overview. Prose around places is nobody's but its author's. The places of other makers
-look alike, with another word for *results*.
+shows the overview. Text outside the places is never changed. Other writers mark their places in the
+same way, with another word for *results*.
 
 | section | what it shows |
 |---|---|
@@ -28,7 +28,7 @@ from tipl.report.tables import Table, cell, headline, label, tables
 from tipl.report.verdict import paragraphs, verdict
 
 DPI = 110
-"""Of pictures in Markdown pages."""
+"""Resolution of pictures in Markdown pages."""
 
 _START = r"<!-- (?P<what>\w+) of (?P<source>[^\s,]+?)(?:, (?P<section>\w+))?(?:: [^\n]*?)? -->\n"
 _CONTENT = r"(?:(?!<!-- \w+ of ).)*?"
@@ -42,17 +42,17 @@ class Place:
     """A part of a page that is rewritten."""
 
     what: str
-    """``results``, or what else its marker says."""
+    """First word of its marker: ``results``, for example."""
     source: str
-    """What it shows: a result file."""
+    """What it shows: a result file, for example."""
     section: str
-    """Which part of that."""
+    """Part of the source that it shows."""
     empty: bool
-    """Whether it has never been written."""
+    """Whether nothing was written into it yet."""
 
 
 def places(page: str) -> list[Place]:
-    """All places of a page, in order."""
+    """Return all places of a page, in order."""
     return [_place(match) for match in _PLACE.finditer(page)]
 
 
@@ -60,10 +60,10 @@ def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> 
     """Return the page with its places of one source rewritten.
 
     Args:
-        page: its text.
-        what: ``results``, or what else the markers say.
-        source: of the places that are written; others stay as they are.
-        render: makes the content of a section.
+        page: the text of the page.
+        what: first word of the markers: ``results``, for example.
+        source: source of the places that are rewritten; others stay as they are.
+        render: returns the content of a section.
 
     Raises:
         EvaluateError: the page has no such place.
@@ -72,7 +72,7 @@ def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> 
         raise EvaluateError(
             f"the page has no place for these {what}",
             expected=f"<!-- {what} of {source} --> and <!-- end of {what} -->, a line each",
-            do="write both lines where they shall stand",
+            do="write both lines where the results belong",
         )
 
     def fill(match: re.Match[str]) -> str:
@@ -86,22 +86,19 @@ def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> 
 
 
 def insert_markdown(results: Results, source: Path, page: Path) -> None:
-    """Write every place of a result file in a Markdown page, and the pictures that it shows.
-
-    Raises:
-        EvaluateError: the page has no such place, or one asks for a section that there is not.
-    """
+    """Write every place of a result file in a Markdown page, and the pictures that it shows."""
     old = page.read_text(encoding="utf-8")
     text = rewrite(old, "results", source.as_posix(), lambda s: render(results, source, s))
-    for place in places(text):
-        if (place.source, place.section) == (source.as_posix(), "figures"):
-            _draw(results, page.parent / source.stem)
-            break
+    if (source.as_posix(), "figures") in {(place.source, place.section) for place in places(text)}:
+        folder = page.parent / source.stem
+        folder.mkdir(exist_ok=True)
+        for title, figure in figures(results).items():
+            figure.savefig(folder / file_name(title), dpi=DPI)
     page.write_text(text, encoding="utf-8")
 
 
 def render(results: Results, source: Path, section: str) -> str:
-    """One section as Markdown; nothing is drawn.
+    """Return one section as Markdown; nothing is drawn.
 
     Raises:
         EvaluateError: there is no such section.
@@ -118,7 +115,7 @@ def render(results: Results, source: Path, section: str) -> str:
 
 
 def table_lines(table: Table) -> list[str]:
-    """A table, line by line."""
+    """Return a table, line by line."""
     lines = [
         "| forecaster | " + " | ".join(table.columns) + " |",
         "|---|" + "---:|" * len(table.columns),
@@ -195,9 +192,3 @@ _SECTIONS: dict[str, Callable[[Results, Path], str]] = {
     "figures": _figures,
     "source": _source,
 }
-
-
-def _draw(results: Results, folder: Path) -> None:
-    folder.mkdir(exist_ok=True)
-    for title, figure in figures(results).items():
-        figure.savefig(folder / file_name(title), dpi=DPI)

@@ -1,15 +1,53 @@
-"""Results as one page that opens from disk."""
+"""Results as one page that opens from disk: what ``tipl evaluate`` writes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jinja2
+from rich.console import Console
 
+from tipl.evaluation.config import EvaluateConfig
+from tipl.evaluation.evaluate import evaluate_only
 from tipl.evaluation.results import Results
+from tipl.forecaster import Forecaster
 from tipl.report.figures import figures, file_name, svg
 from tipl.report.tables import cell, headline, label, tables
 from tipl.report.verdict import verdict
+
+
+def evaluate(
+    forecasters: Sequence[Forecaster],
+    config: EvaluateConfig,
+    *,
+    workers: int = 1,
+    imports: Sequence[str] = (),
+    console: Console | None = None,
+) -> Results:
+    """Evaluate forecasters beside persistence; write ``results.json``, a page and figures.
+
+    Measurements are kept in ``config.out``: the same call goes on where it stopped, and further
+    forecasters only cost their own measurements.
+
+    Args:
+        forecasters: what is evaluated; persistence is added, and the oracle of each TIPL's rank.
+        config: on what, and how much.
+        workers: number of processes; 1 means this one.
+        imports: modules that register environments; every worker imports them.
+        console: where progress is shown; None: nowhere.
+
+    Returns:
+        What ``results.json`` holds.
+
+    Raises:
+        EvaluateError: the runs do not fit together, are too short, or have no returns, or two
+            forecasters have one name.
+        KeyboardInterrupt: it was stopped; the measurements stay.
+    """
+    results = evaluate_only(forecasters, config, workers, imports, console or Console(quiet=True))
+    write_report(results, config.out)
+    return results
 
 
 def write_report(results: Results, out: Path) -> Path:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -21,11 +21,12 @@ from torch import Tensor
 
 import weighttraj as wt
 from tipl.errors import RepresentationError, TrainError
-from tipl.horizons import too_short
-from tipl.runs import checksum_of, fault_of, weights_of, without_faults
+from tipl.horizons import fitted, too_short
+from tipl.runs import checksum_of, fault_of, warn_left_out, weights_of
+from tipl.saved import SavedNetwork
 from tipl.settings import check_settings
 from tipl.training.config import LoopConfig, flat
-from tipl.training.loop import Examples, Learner
+from tipl.training.loop import Examples, Learner, train_network
 from weighttraj.progress import LoggedProgress
 
 LOOK_AT = 64
@@ -58,6 +59,8 @@ class StartsConfig:
     """Folder of the model. A training that stopped goes on from its last checkpoint."""
     starts: int = 600
     """Number of starts of each run that are trained on, about."""
+    network: Any
+    """Sizes of the network, ``horizons`` and ``phases`` among them."""
     training: LoopConfig
     """How the network is trained."""
 
@@ -73,14 +76,22 @@ class StartsConfig:
 class StartsLearner(Learner[E]):
     """Base of the learners that are trained on starts: it reads the runs and draws the batches."""
 
-    def __init__(self, config: StartsConfig, horizons: Sequence[int]) -> None:
-        self.config, self.horizons = config, horizons
+    model: ClassVar[type[SavedNetwork[Any, Any]]]
+    """The forecaster that is made of the network."""
+
+    def __init__(self, config: StartsConfig) -> None:
+        self.config, self.horizons = config, fitted(config.network.horizons)
         datasets = [wt.open_dataset(data) for data in config.data]
         self.train = [dataset.split("train").runs for dataset in datasets]
         self.held_out = [
             [run for run in dataset if run.split == "validation"] for dataset in datasets
         ]
-        self.every, self.phases = cadence_of([run for group in self.train for run in group])
+        every, phases = cadence_of([run for group in self.train for run in group])
+        sizes = replace(
+            config.network, horizons=self.horizons, phases=config.network.phases or phases
+        )
+        self.model_config = self.model.config_type(network=sizes, every=every)
+        self.network = self.model.build(self.model_config)
 
     @abstractmethod
     def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
@@ -126,6 +137,10 @@ class StartsLearner(Learner[E]):
             return ()
         return [held_out[i : i + LOOK_AT] for i in range(0, len(held_out), LOOK_AT)]
 
+    def save(self, out: Path) -> None:
+        """Write the model."""
+        self.model(self.network, self.model_config).save(out)
+
     def _gather(self, groups: Sequence[Sequence[wt.Run]], console: Console) -> E | None:
         columns = (TextColumn("reading runs"), BarColumn(), MofNCompleteColumn())
         with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
@@ -140,6 +155,21 @@ class StartsLearner(Learner[E]):
         if not reached or not torch.stack(reached).any(0).all():
             return None
         return self.collate(found)
+
+
+def train_on_starts(
+    learner: type[StartsLearner[Any]], config: StartsConfig, console: Console | None
+) -> None:
+    """Train what a learner makes of a config, or go on where its training stopped."""
+    config.check()
+    train_network(
+        lambda *_: learner(config),
+        config.training,
+        config.out,
+        learner.settings,
+        defaults=flat(config),
+        console=console,
+    )
 
 
 def gather(
@@ -164,15 +194,13 @@ def gather(
     faults: dict[str, str] = {}
     for group, runs in enumerate(groups):
         for number, run in enumerate(runs):
-            mine: list[Example] = []
-
-            def fault(run: wt.Run, group: int = group, number: int = number) -> str | None:
-                rng = np.random.default_rng([seed, group, number])
-                return _examples_or_fault(run, rng, examples_of, mine)  # noqa: B023
-
-            faults |= without_faults([run], fault)[1]
-            place = {"group": torch.tensor(group)}
-            found += [one | place for one in mine]
+            rng = np.random.default_rng([seed, group, number])
+            mine = _examples_or_fault(run, rng, examples_of)
+            if isinstance(mine, str):
+                faults[run.id] = mine
+                warn_left_out(run.id, mine)
+            else:
+                found += [one | {"group": torch.tensor(group)} for one in mine]
             progress(run)
     if faults and len(faults) == sum(map(len, groups)):
         raise TrainError(
@@ -188,17 +216,15 @@ def _examples_or_fault(
     run: wt.Run,
     rng: np.random.Generator,
     examples_of: Callable[[wt.Run, np.random.Generator], Iterable[Example]],
-    found: list[Example],
-) -> str | None:
-    """Append the examples of a run; return why there are none, in words."""
+) -> list[Example] | str:
+    """Return the examples of a run, or in words why there are none."""
     if (why := fault_in_training(run)) is not None:
         return why
     try:
-        found.extend(examples_of(run, rng))
+        found = list(examples_of(run, rng))
     except RepresentationError as error:
-        found.clear()
         return error.message.partition("\n")[0]
-    return None if found else "no start of it can be trained on"
+    return found or "no start of it can be trained on"
 
 
 def fault_in_training(run: wt.Run) -> str | None:

@@ -189,28 +189,24 @@ def _checks(metrics: Metrics) -> str:
     checks = metrics.checks
     if checks is None:
         return ""
-    null = ", ".join(f"{skill:.2g} at h = {h}" for h, skill in checks["null"].items())
+    null = ", ".join(f"{skill:.2g} at h = {h}" for h, skill in checks.null.items())
     lines = ["## Five checks", "", "| check | measured | passes |", "|---|---|---|"]
     for name, meaning in _TESTS.items():
-        shown = f"skill {null}" if name == "null" else _measured(name, checks[name])
-        lines.append(f"| {meaning} | {shown} | {'yes' if checks['passed'][name] else 'no'} |")
-    limits = checks["largest"]
+        shown = f"skill {null}" if name == "null" else _measured(name, getattr(checks, name))
+        lines.append(f"| {meaning} | {shown} | {'yes' if checks.passed[name] else 'no'} |")
+    limits = checks.largest
+    batches = "" if metrics.kind == "regression" else f", for {checks.batches:,} batches"
     again = (
-        f"For the random walks one like it was fitted to {checks['walks'] - 2} others"
-        f"{_batches(metrics.kind, checks)}. "
-        if checks["fitted_to_walks"]
+        f"For the random walks one like it was fitted to {checks.walks - 2} others{batches}. "
+        if checks.fitted_to_walks
         else ""
     )
     lines += [
         "",
-        f"{again}A skill passes below {limits['null']} either way, an error, relative to the "
-        f"displacement, below {limits['error']}. On run `{checks['run']}`: `{checks['command']}`",
+        f"{again}A skill passes below {limits.null} either way, an error, relative to the "
+        f"displacement, below {limits.error}. On run `{checks.run}`: `{checks.command}`",
     ]
     return "\n".join(lines)
-
-
-def _batches(kind: str, checks: dict[str, Any]) -> str:
-    return "" if kind == "regression" else f", for {checks['batches']:,} batches"
 
 
 def _measured(name: str, value: object) -> str:

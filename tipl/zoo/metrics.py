@@ -8,8 +8,9 @@ from typing import Any
 
 import msgspec
 
+from tipl.checks.results import CheckResults
 from tipl.errors import ModelError
-from tipl.evaluation.results import Results, Scores, encoded
+from tipl.evaluation.results import Results, Scores
 
 FILE = "metrics.json"
 
@@ -56,7 +57,7 @@ class Metrics:
     """Settings of the training."""
     log: list[dict[str, float]] = field(default_factory=list)
     """Some lines of the training's log: ``batch``, and errors on training and validation runs."""
-    checks: dict[str, Any] | None = None
+    checks: CheckResults | None = None
     """What ``tipl check`` wrote; None: not checked."""
 
     @property
@@ -84,8 +85,3 @@ def read_metrics(folder: Path) -> Metrics | None:
             where=file,
             do="release the model again",
         ) from error
-
-
-def write_metrics(folder: Path, metrics: Metrics) -> None:
-    """Put the file beside the model."""
-    (folder / FILE).write_text(encoded(metrics), encoding="utf-8")

@@ -28,11 +28,12 @@ from safetensors.numpy import load_file, save
 
 import weighttraj as wt
 from tipl import registry
+from tipl.checks.results import CheckResults, read_checks
 from tipl.errors import ModelError
-from tipl.evaluation.results import Results, Scores, read_results
+from tipl.evaluation.results import Results, Scores, read_results, write_document
 from tipl.report.scores import REPW, SKILL, function_skill, oracles, shown
 from tipl.saved import fingerprint
-from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics, write_metrics
+from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics
 
 MOST = 3_000_000
 """Bytes of a model's arrays. Larger ones are rounded to float16, and refused if still larger."""
@@ -93,7 +94,7 @@ def release(
     if metrics is None:
         (out / FILE).unlink(missing_ok=True)
     else:
-        write_metrics(out, metrics)
+        write_document(out / FILE, metrics)
     return out
 
 
@@ -227,13 +228,13 @@ def _find(results: Results, mark: str, name: str, where: Path) -> str:
     return next(str(n) for n, m in marks.items() if m == mark)
 
 
-def _checks(file: Path, mark: str, name: str) -> dict[str, Any]:
-    checks = _json(file)
-    if checks.get("fingerprint") != mark:
+def _checks(file: Path, mark: str, name: str) -> CheckResults:
+    checks = read_checks(file)
+    if checks.fingerprint != mark:
         raise ModelError(
             "the checks are not of this model",
             expected=f"fingerprint {mark}",
-            got=checks.get("fingerprint"),
+            got=checks.fingerprint,
             where=file,
             do=f"release it without them, and check what then lies in the zoo: `tipl check {name} "
             "...`",

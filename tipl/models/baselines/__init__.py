@@ -20,13 +20,12 @@
 from __future__ import annotations
 
 from tipl.horizons import HORIZONS
-from tipl.models.baselines.endpoints import EndPoints
+from tipl.models.baselines.features import Ema, EndPoints, Slope, Steps
 from tipl.models.baselines.modes import ModeSteps
 from tipl.models.baselines.naive import Extrapolation, Persistence
 from tipl.models.baselines.nowcasters import WNN, NinoMLP
 from tipl.models.baselines.reconstruction import Reconstruction
 from tipl.models.baselines.regression import Regression
-from tipl.models.baselines.steps import Ema, Slope, Steps
 from tipl.models.baselines.subspace import DMD, ProjectedSteps
 from tipl.models.baselines.train import (
     BaselinesConfig,

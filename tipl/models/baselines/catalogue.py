@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from tipl.models.baselines.endpoints import EndPoints
-from tipl.models.baselines.features import Features
+from tipl.models.baselines.features import Ema, EndPoints, Features, Slope, Steps
 from tipl.models.baselines.modes import ModeSteps
-from tipl.models.baselines.steps import Ema, Slope, Steps
 from tipl.models.baselines.subspace import ProjectedSteps
+from tipl.saved import broken
 
-FEATURES: dict[str, type[Features]] = {
-    "steps": Steps,
-    "slope": Slope,
-    "ema": Ema,
-    "projected-steps": ProjectedSteps,
-    "mode-steps": ModeSteps,
-    "end-points": EndPoints,
+KINDS: dict[str, type[Features]] = {
+    cls.kind: cls for cls in (Steps, Slope, Ema, ProjectedSteps, ModeSteps, EndPoints)
 }
 
 
-def features_of(settings: Mapping[str, Any]) -> Features:
-    """Features as ``Features.settings`` describes them.
+def features_of(settings: Mapping[str, Any], path: str | Path) -> Features:
+    """Return the features that ``Features.settings`` describes; ``path`` is where they were saved.
 
     Raises:
-        ValueError: there are no such features.
+        ModelError: there are no such features.
     """
     fields = dict(settings)
     kind = fields.pop("kind", None)
-    if kind not in FEATURES:
-        raise ValueError(f"features of kind {kind!r}; there are {sorted(FEATURES)}")
-    return msgspec.convert(fields, FEATURES[kind])
+    if kind not in KINDS:
+        raise broken(path, f"features of kind {kind!r}; there are {sorted(KINDS)}")
+    try:
+        return msgspec.convert(fields, KINDS[kind])
+    except msgspec.ValidationError as error:
+        raise broken(path, error) from error

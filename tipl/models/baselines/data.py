@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
 from tipl.runs import Rows, columns_of, fault_of, stratified, weights_of, without_faults
-from weighttraj import ParamLayout, Run
+from weighttraj import Run
 
 SAMPLE = 2048
-"""Parameters of a run that a fit looks at."""
+"""Number of parameters of a run that a fit looks at."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,13 +37,14 @@ class Trajectory:
     @classmethod
     def of(cls, run: Run) -> Trajectory:
         """Return all parameters of a run; rows are read when they are sliced."""
-        tensor, matrix = _tensors(run.layout)
+        sizes = [param.size for param in run.layout.params]
+        is_matrix = [param.role == "weight" for param in run.layout.params]
         return cls(
             weights=weights_of(run),
             phase=run.phase,
-            tensor=tensor,
-            matrix=matrix,
-            importance=np.ones(len(tensor)),
+            tensor=np.repeat(np.arange(len(sizes)), sizes),
+            matrix=np.repeat(is_matrix, sizes),
+            importance=np.ones(run.layout.size),
         )
 
     def __len__(self) -> int:
@@ -64,15 +65,9 @@ class Trajectory:
     def windows(
         self, starts: Sequence[int], history: int
     ) -> Iterator[tuple[int, Float64[np.ndarray, "row param"]]]:
-        """Yield the snapshots that each start looks back on.
+        """Yield the place of each start, in the order of time, and the snapshots up to it.
 
-        Args:
-            starts: snapshots, in any order.
-            history: snapshots before each start.
-
-        Yields:
-            The place of a start among the starts, and its window, oldest snapshot first: the start
-            is the last row. There are fewer than ``history + 1`` near the beginning of the run.
+        These are up to ``history`` snapshots before the start and, as the last row, the start.
         """
         for place in np.argsort(np.asarray(starts), kind="stable").tolist():
             t = starts[place]
@@ -96,8 +91,8 @@ def thinned(
 ) -> tuple[Int[np.ndarray, " start"], Float[np.ndarray, " start"]]:
     """Return at most ``limit`` of the starts 0, ..., n - 1, and how many each stands for.
 
-    The first half of the limit is taken whole: there the steps are largest. The others are drawn
-    at random, as every k-th could fall on the same phase again and again.
+    The first ``limit // 2`` are all taken, as the steps are largest there. The others are drawn at
+    random: every k-th one could always be of the same phase.
     """
     if n <= limit:
         return np.arange(n), np.ones(n)
@@ -111,7 +106,7 @@ def thinned(
 def renewal(t: int) -> int:
     """Return the last snapshot up to t at which costly features of the past are computed again.
 
-    These are the snapshots 1, 2, ..., 20 and then each that makes the past a tenth longer.
+    These are the snapshots 1, 2, ..., 20, and then each that makes the past a tenth longer.
 
     >>> [renewal(t) for t in (0, 7, 21, 22, 25, 1000)]
     [0, 7, 20, 22, 24, 972]
@@ -120,9 +115,3 @@ def renewal(t: int) -> int:
     while (following := max(now + 1, now * 11 // 10)) <= t:
         now = following
     return now
-
-
-def _tensors(layout: ParamLayout) -> tuple[np.ndarray, np.ndarray]:
-    sizes = [param.size for param in layout.params]
-    matrix = [param.role == "weight" for param in layout.params]
-    return np.repeat(np.arange(len(sizes)), sizes), np.repeat(matrix, sizes)

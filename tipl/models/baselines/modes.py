@@ -1,21 +1,20 @@
 """CMD: parameters that move together move as one of few.
 
 After "Enhancing Neural Training via a Correlated Dynamics Model" (Brokman et al., ICLR 2024,
-arXiv:2312.13247). The paper fixes: the parameters are split into few modes of high correlation
-over time, by hierarchical clustering of a sample; each mode has a reference, the parameter that is
-most correlated with the others of its mode; every other parameter joins the mode whose reference it
-is most correlated with, and is modelled as an affine function of it, w_i = a_i w_ref + b_i.
+arXiv:2312.13247). The paper fixes: hierarchical clustering of a sample splits the parameters into
+few modes of high correlation over time; each mode has a reference, the parameter that is most
+correlated with the others of its mode; every other parameter joins the mode whose reference it is
+most correlated with, and is modelled as an affine function of it, w_i = a_i w_ref + b_i.
 
 The paper describes a training in these terms and forecasts nothing. Ours: correlations and affine
-functions are those of the last 21 snapshots, the modes are found again at each ``renewal``; of
-parameters that are equally correlated the one that moves most is the reference; a step of a
-parameter is a_i times the step of its reference, and a regression on the last 20 of these steps
-forecasts. 10 modes, as few as the paper speaks of (on validation runs of InvertedPendulum skill at
-h = 1 is 0.22 with 10 modes and 0.27 with 30; on some of them it was 0.19 with correlations over 50
-snapshots instead of 21, and 0.17 over the whole past).
+functions are those of the last 21 snapshots; the modes are found again at each ``renewal``; of
+equally correlated parameters the one that moves most is the reference; a step of a parameter is a_i
+times the step of its reference, and a regression on the last 20 of these steps forecasts. 10 modes,
+as in the paper (on validation runs of InvertedPendulum skill at h = 1 is 0.22 with 10 modes and
+0.27 with 30; on some of them 0.19 with correlations over 50 snapshots, 0.17 over the whole past).
 
-Of large policies 500 parameters are clustered, chosen by their place: a permutation of hidden
-units then chooses others. Up to 500 parameters it commutes with permutations, but for ties.
+Of a large policy 500 parameters are clustered, chosen by their place, so a permutation of hidden
+units chooses others. Up to 500 parameters the forecast follows permutations, except for ties.
 """
 
 from __future__ import annotations
@@ -27,31 +26,30 @@ import numpy as np
 from jaxtyping import Float64, Int
 
 from tipl.models.baselines.data import Trajectory, renewal
-from tipl.models.baselines.features import Features, Inputs
-from tipl.models.baselines.steps import last_steps
+from tipl.models.baselines.features import Features, Inputs, last_steps
 
 CLUSTERED = 500
-"""Parameters that are clustered."""
+"""Number of parameters that are clustered."""
 
 
 @dataclass(frozen=True)
 class ModeSteps(Features):
-    """The last steps as the modes tell them."""
+    """The last steps of each mode's reference, times the slope of the parameter."""
 
     lags: int = 20
-    """How many steps; correlations are taken over the snapshots around them."""
+    """Number of steps; correlations are taken over the snapshots around them."""
     modes: int = 10
-    """How many modes."""
+    """Number of modes."""
     kind = "mode-steps"
     name = "cmd"
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """Number of features."""
         return self.lags
 
     def __call__(self, trajectory: Trajectory, starts: Sequence[int]) -> Iterator[Inputs]:
-        """The features of each start; 0 for phi_0."""
+        """Yield the features of each start."""
         found, references = -1, np.zeros(0, int)
         for place, window in trajectory.windows(starts, self.lags):
             if (newest := renewal(starts[place])) != found:
@@ -66,7 +64,7 @@ class ModeSteps(Features):
 def find_references(
     window: Float64[np.ndarray, "time param"], modes: int
 ) -> Int[np.ndarray, " mode"]:
-    """The reference parameter of each mode."""
+    """Return the reference parameter of each mode."""
     count = window.shape[1]
     sample = np.unique(np.linspace(0, count - 1, min(count, CLUSTERED)).round().astype(int))
     centred = window[:, sample] - window[:, sample].mean(0)
@@ -84,14 +82,9 @@ def find_references(
 
 
 def cluster(alike: Float64[np.ndarray, "item item"], count: int) -> Int[np.ndarray, " item"]:
-    """Agglomerative clustering with average linkage.
+    """Return the cluster of each item, named by one of its members: average linkage.
 
-    Args:
-        alike: how alike two items are, symmetric.
-        count: clusters that are left.
-
-    Returns:
-        The cluster of each item, named after one of its members.
+    ``alike`` says how alike two items are, and ``count`` is the number of clusters.
     """
     alike = alike.copy()
     np.fill_diagonal(alike, -np.inf)
@@ -109,7 +102,7 @@ def cluster(alike: Float64[np.ndarray, "item item"], count: int) -> Int[np.ndarr
 def _affine(
     window: Float64[np.ndarray, "time param"], references: Int[np.ndarray, " mode"]
 ) -> tuple[Int[np.ndarray, " param"], Float64[np.ndarray, " param"]]:
-    """The mode of each parameter, and a_i of its affine function of the reference."""
+    """Return the mode of each parameter, and a_i of its affine function of the reference."""
     centred = window - window.mean(0)
     squared = (centred**2).sum(0)
     products = centred[:, references].T @ centred  # (mode, param)

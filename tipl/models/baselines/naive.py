@@ -1,4 +1,4 @@
-"""Forecasts without a fit: persistence, and a straight line from the last weights."""
+"""Baselines that need no fit: persistence, and a straight line from the last weights."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from jaxtyping import Float32
 from tipl.forecaster import Forecaster, check_request
 from tipl.models.baselines.catalogue import features_of
 from tipl.models.baselines.data import Trajectory
-from tipl.models.baselines.features import Features
+from tipl.models.baselines.features import Ema, Features, Slope, Steps
+from tipl.models.baselines.subspace import DMD
 from tipl.runs import weights_of
-from tipl.saved import broken, read_config, read_settings, write
+from tipl.saved import SavedSettings, broken, read_config, write
 from weighttraj import Run
 
 
 @dataclass(frozen=True)
-class Persistence(Forecaster):
+class Persistence(SavedSettings):
     """Persistence: the forecast of phi_{t+h} is phi_t."""
 
     name = "persistence"
     kind = "persistence"
-    causal = True
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
@@ -34,16 +34,6 @@ class Persistence(Forecaster):
         check_request(run, starts, horizons)
         last = weights_of(run)[np.asarray(starts)]
         return np.repeat(last[:, None], len(horizons), axis=1)
-
-    def save(self, path: str | Path) -> None:
-        """Write config.json; there is nothing fitted."""
-        write(path, {"kind": self.kind})
-
-    @classmethod
-    def load(cls, path: str | Path) -> Persistence:
-        """Return a new one, if the folder says so."""
-        read_settings(path, cls.kind)
-        return cls()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +53,6 @@ class Extrapolation(Forecaster):
     velocity: Features
     """What v_t is; one feature."""
     kind = "extrapolation"
-    causal = True
 
     @property
     def name(self) -> str:
@@ -87,17 +76,21 @@ class Extrapolation(Forecaster):
 
     @classmethod
     def load(cls, path: str | Path) -> Extrapolation:
-        """Read what v_t is.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the folder holds another one.
-        """
+        """Read what v_t is."""
         config = read_config(path, cls.kind, _Config)
-        try:
-            velocity = features_of(config.velocity)
-        except ValueError as error:
-            raise broken(path, error) from error
+        velocity = features_of(config.velocity, path)
         if velocity.size != 1:
             raise broken(path, f"a velocity of {velocity.size:.3g} features, not of 1")
         return cls(velocity)
+
+
+BETAS = (0.9, 0.95, 0.98)
+"""Decays of the moving averages of steps."""
+UNFITTED: tuple[Forecaster, ...] = (
+    Persistence(),
+    Extrapolation(Steps(1)),
+    *(Extrapolation(Slope(window)) for window in (5, 20, 50, 200)),
+    *(Extrapolation(Ema(beta)) for beta in BETAS),
+    DMD(),
+)
+"""All baselines that need no fit, in the order of tables."""

@@ -15,10 +15,7 @@ from tipl.training import Examples
 class Streams(nn.Module):
     """Two streams of fully connected layers, one for values and one for differences, then joined.
 
-    Args:
-        inputs: numbers in, half of them for each stream.
-        width: units of a layer.
-        outputs: numbers out.
+    Each stream takes half of the inputs.
     """
 
     def __init__(self, inputs: int, width: int, outputs: int) -> None:
@@ -28,20 +25,14 @@ class Streams(nn.Module):
         self.head = _zero(nn.Linear(2 * width, outputs))
 
     def forward(self, x: Float[Tensor, "row input"]) -> Float[Tensor, "row output"]:
-        """Outputs; 0 before training."""
+        """Return the outputs, which are 0 before training."""
         values, differences = x.chunk(2, dim=-1)
         joined = torch.cat([self.values(values), self.differences(differences)], dim=-1)
         return self.head(joined)  # type: ignore[no-any-return]
 
 
 class Perceptron(nn.Module):
-    """Fully connected layers.
-
-    Args:
-        inputs: numbers in.
-        width: units of a layer.
-        outputs: numbers out.
-    """
+    """Fully connected layers."""
 
     def __init__(self, inputs: int, width: int, outputs: int) -> None:
         super().__init__()
@@ -49,18 +40,12 @@ class Perceptron(nn.Module):
         self.head = _zero(nn.Linear(width, outputs))
 
     def forward(self, x: Float[Tensor, "row input"]) -> Float[Tensor, "row output"]:
-        """Outputs; 0 before training."""
+        """Return the outputs, which are 0 before training."""
         return self.head(self.body(x))  # type: ignore[no-any-return]
 
 
 class PerParameter(nn.Module):
-    """One network for every parameter of its group, with the scales of its inputs and outputs.
-
-    Args:
-        networks: one for each group of parameters.
-        inputs: numbers in.
-        horizons: how far to look.
-    """
+    """A network for each group of parameters, with the scales of their inputs and outputs."""
 
     input_mean: Tensor
     input_std: Tensor
@@ -79,7 +64,7 @@ class PerParameter(nn.Module):
         scale: Float[Tensor, " row"],
         group: Int[Tensor, " row"],
     ) -> Float[Tensor, "row horizon"]:
-        """Displacements in units of the scale's."""
+        """Return displacements, in the unit of ``scale``."""
         x = (x - self.input_mean) / self.input_std
         out = x.new_zeros(len(x), len(self.output_scale))
         for number, network in enumerate(self.networks):
@@ -120,7 +105,7 @@ def loss_of(
 ) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
     """Return squared errors over the RMS step and the root of the horizon, summed, and their count.
 
-    So starts count alike, early or late, and horizons too.
+    All starts and all horizons count alike.
     """
     predicted = network(rows.x, rows.scale, rows.group)
     known = rows.target.isfinite()

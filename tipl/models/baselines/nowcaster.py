@@ -2,9 +2,8 @@
 
 Loss, sizes and training are our choices, the same for all: two layers; squared errors of
 displacements over the RMS of the last 20 steps and the root of the horizon, so that early and late
-starts count alike; all horizons at once; the head begins at 0, which is persistence. Starts are
-drawn half evenly, half on a logarithmic scale. Half a minute of training on one core; the state
-that is best on validation runs is kept.
+starts count alike; all horizons at once; the head begins at 0, which is persistence. Training takes
+half a minute on one core; the state that is best on validation runs is kept.
 """
 
 from __future__ import annotations
@@ -27,14 +26,15 @@ from tipl.models.baselines.network import ParameterRows, PerParameter, loss_of, 
 from tipl.saved import SavedNetwork
 from tipl.threads import threads
 from tipl.training import Learner, LoopConfig, train_network
+from tipl.training.starts import draw_starts
 from weighttraj import Run
 
 SCALE_STEPS = 20
-"""Steps whose RMS is the local scale of the loss."""
+"""Number of steps whose RMS is the local scale of the loss."""
 ROWS_OF_A_RUN = 40_000
-"""Examples that are drawn from one run."""
+"""Number of examples that are drawn from one run."""
 STARTS_OF_A_RUN = 300
-"""Starts among them."""
+"""Number of starts among them."""
 
 
 N = TypeVar("N", bound="Nowcaster")
@@ -47,9 +47,9 @@ class NowcasterConfig:
     horizons: tuple[int, ...] = HORIZONS
     """Horizons that it forecasts, rising."""
     context: int = 5
-    """Snapshots that it sees, as in both papers."""
+    """Number of snapshots that it sees, as in both papers."""
     width: int = 32
-    """Units of a layer."""
+    """Number of units of a layer."""
 
 
 LOOP = LoopConfig(
@@ -60,9 +60,8 @@ LOOP = LoopConfig(
 
 @dataclass(frozen=True, eq=False)
 class Nowcaster(SavedNetwork[PerParameter, NowcasterConfig]):
-    """What both networks have in common."""
+    """Base of both networks."""
 
-    causal = True
     config_type = NowcasterConfig
 
     @classmethod
@@ -97,8 +96,8 @@ class Nowcaster(SavedNetwork[PerParameter, NowcasterConfig]):
         Args:
             runs: training runs.
             validation_runs: other runs; the network that does best on them is kept.
-            horizons: how far to look.
-            seed: of the sample, the first weights and the batches.
+            horizons: numbers of snapshots ahead.
+            seed: seed of the sample, the first weights and the batches.
             training: settings of the loop; None: ``LOOP``.
 
         Raises:
@@ -116,11 +115,7 @@ class Nowcaster(SavedNetwork[PerParameter, NowcasterConfig]):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and what the network adds to it.
-
-        Raises:
-            ForecastError: it was not trained for such a horizon.
-        """
+        """Return phi_t and what the network adds to it."""
         check_request(run, starts, horizons)
         rows = rows_of(self.config.horizons, horizons, self.name)
         trajectory = Trajectory.of(run)
@@ -138,11 +133,8 @@ class Nowcaster(SavedNetwork[PerParameter, NowcasterConfig]):
 class NowcasterFit(Generic[N]):
     """A fit that takes one run after the other and keeps some rows of each.
 
-    Args:
-        kind: which network.
-        config: its sizes.
-        seed: of the sample, the first weights and the batches.
-        training: settings of the loop; None: ``LOOP``.
+    The seed is that of the sample, the first weights and the batches; without ``training`` the loop
+    runs with ``LOOP``.
     """
 
     def __init__(
@@ -153,29 +145,19 @@ class NowcasterFit(Generic[N]):
         seed: int = 0,
         training: LoopConfig | None = None,
     ) -> None:
-        self._kind, self._config, self._seed = kind, config, seed
+        self._kind, self._config = kind, config
         self._training = replace(training or LOOP, seed=seed)
         self._rng = np.random.default_rng(seed)
         self._rows: dict[bool, list[dict[str, np.ndarray]]] = {False: [], True: []}
 
-    @property
-    def name(self) -> str:
-        """Of what comes out."""
-        return self._kind.name
-
     def add(self, trajectory: Trajectory, *, validation: bool = False) -> None:
-        """Look at one run."""
+        """Keep rows of one run."""
         trajectory = trajectory.sample(512, self._rng)
         count = min(STARTS_OF_A_RUN, 1 + ROWS_OF_A_RUN // len(trajectory.tensor))
-        last = len(trajectory) - 1 - self._config.horizons[0]
-        if last < 1:
-            return
-        u = self._rng.uniform(size=count)
-        even, early = 1 + u * last, np.exp(u * np.log(last + 1))  # the learning phase is short
-        starts = np.unique(np.where(np.arange(count) % 2, even, early).astype(int))
+        starts = draw_starts(len(trajectory) + 1 - self._config.horizons[0], count, self._rng)
         groups = self._kind.groups(trajectory)
-        for place, window in trajectory.windows(starts.tolist(), SCALE_STEPS):
-            row = self._example(trajectory, int(starts[place]), window, groups)
+        for place, window in trajectory.windows(starts, SCALE_STEPS):
+            row = self._example(trajectory, starts[place], window, groups)
             self._rows[validation].append(row)
 
     def _example(
@@ -218,7 +200,7 @@ class NowcasterFit(Generic[N]):
                 return NowcasterLearner(model, examples, validation, self._training)
 
             train_network(build, self._training, out)
-            return replace(self._kind.load(out), name=self.name)
+            return replace(self._kind.load(out), name=self._kind.name)
 
 
 class NowcasterLearner(Learner[ParameterRows]):
@@ -258,7 +240,7 @@ class NowcasterLearner(Learner[ParameterRows]):
 
 
 def _examples(rows: list[dict[str, np.ndarray]]) -> ParameterRows | None:
-    """Rows of all starts in one; None: there are none."""
+    """Return the rows of all starts together; None: there are none."""
     if not rows:
         return None
     joined = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
@@ -269,7 +251,7 @@ def _examples(rows: list[dict[str, np.ndarray]]) -> ParameterRows | None:
 def _filled(
     window: Float64[np.ndarray, "row param"], context: int
 ) -> Float64[np.ndarray, "context param"]:
-    """The last snapshots; the oldest one again and again before the beginning of the run."""
+    """Return the last snapshots; those before the run repeat the oldest one."""
     missing = max(0, context - len(window))
     return np.concatenate([np.repeat(window[:1], missing, axis=0), window[-context:]])
 

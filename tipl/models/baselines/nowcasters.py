@@ -1,6 +1,6 @@
-"""WNN and NiNo's MLP, re-implemented from what the papers say of them.
+"""WNN and NiNo's MLP, re-implemented from their papers.
 
-Neither commutes with a flip of signs: their units are no odd functions.
+Neither follows a flip of signs: their units are no odd functions.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class WNN(Nowcaster):
     parameter is 1e-3 of its value here: its value over its range is no input); snapshots in place
     of epochs; layers of 32.
 
-    It sees a step only in proportion to the range of its own parameter. So it is indifferent to
-    the scale of the steps, and cannot forecast a parameter that rests.
+    It sees a step in proportion to the range of its own parameter. So the scale of the steps does
+    not matter, and a parameter that rests cannot be forecast.
     """
 
     name: str = "wnn"
@@ -46,14 +46,14 @@ class WNN(Nowcaster):
     def inputs(
         window: Float64[np.ndarray, "context param"], trajectory: Trajectory
     ) -> tuple[Float64[np.ndarray, "param input"], Float64[np.ndarray, " param"]]:
-        """Values relative to the newest, then differences, over the range of the window."""
+        """Return values relative to the newest and differences, over the range of the window."""
         extent = np.ptp(window, axis=0)
         seen = np.concatenate([(window - window[-1])[:-1], np.diff(window, axis=0)])
         return (seen / np.maximum(extent, np.finfo(np.float32).tiny)).T, extent
 
     @staticmethod
     def groups(trajectory: Trajectory) -> np.ndarray:
-        """Weights, then biases and deviations."""
+        """Return 0 for weights, 1 for biases and deviations."""
         return np.where(trajectory.matrix, 0, 1)
 
 
@@ -69,8 +69,8 @@ class NinoMLP(Nowcaster):
     deviation of its layer and would be lost), each standardised over the training runs; layers
     of 32.
 
-    The scale of a layer doesn't fall with the steps, so the network has to know by itself when a
-    run has slowed down, and it is not indifferent to the scale of the steps.
+    The scale of a layer does not fall with the steps, so the scale of the steps matters, and the
+    network has to find out when a run has slowed down.
     """
 
     name: str = "nino-mlp"
@@ -86,21 +86,21 @@ class NinoMLP(Nowcaster):
     def inputs(
         window: Float64[np.ndarray, "context param"], trajectory: Trajectory
     ) -> tuple[Float64[np.ndarray, "param input"], Float64[np.ndarray, " param"]]:
-        """The newest scaled state, then scaled differences."""
+        """Return the newest scaled state and scaled differences."""
         mean, deviation = _layer_scales(window, trajectory)
         newest = (window[-1] - mean) / deviation
         return np.concatenate([newest[None], np.diff(window, axis=0) / deviation]).T, deviation
 
     @staticmethod
     def groups(trajectory: Trajectory) -> np.ndarray:
-        """All in one."""
+        """Return 0 for all."""
         return np.zeros(len(trajectory.tensor), np.int64)
 
 
 def _layer_scales(
     window: Float64[np.ndarray, "context param"], trajectory: Trajectory
 ) -> tuple[Float64[np.ndarray, " param"], Float64[np.ndarray, " param"]]:
-    """Mean and deviation of a parameter's tensor over a window."""
+    """Return mean and deviation of each parameter's tensor over a window."""
     tensor = trajectory.tensor
     counts = np.bincount(tensor)
     mean = (np.bincount(tensor, window.mean(0)) / counts)[tensor]

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
 from tipl.errors import ForecastError
-from tipl.forecaster import Forecaster, check_request
+from tipl.forecaster import check_request
 from tipl.representation import embed
-from tipl.saved import read_config, write
+from tipl.saved import SavedSettings
 from weighttraj import Run
 
 
 @dataclass(frozen=True)
-class Reconstruction(Forecaster):
+class Reconstruction(SavedSettings):
     """The truth, phi_{t+h}, after a round trip through d coefficients: an oracle, no forecast.
 
     A model that predicts coefficients in the basis of the whole run cannot have a smaller error.
@@ -37,7 +36,7 @@ class Reconstruction(Forecaster):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_{t+h} projected to the first d directions of the run.
+        """Return phi_{t+h} projected onto the first d directions of the run.
 
         Raises:
             ForecastError: the run ends before.
@@ -54,17 +53,3 @@ class Reconstruction(Forecaster):
         later = np.asarray(starts)[:, None] + np.asarray(horizons)
         back = embedded.svd.inverse_transform(embedded.coefficients[later])
         return back.astype(np.float32)
-
-    def save(self, path: str | Path) -> None:
-        """Write config.json."""
-        write(path, {"kind": self.kind, "rank": self.rank})
-
-    @classmethod
-    def load(cls, path: str | Path) -> Reconstruction:
-        """Read the rank.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the folder holds another one.
-        """
-        return read_config(path, cls.kind, cls)

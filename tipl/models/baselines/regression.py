@@ -4,18 +4,18 @@
 least squares; with ``by_phase`` also each part of the PPO iteration. The same coefficients serve
 every parameter, so a fit on a policy of 122 forecasts one of 71,948.
 
-Every start counts as it is. Steps shrink up to 400 times over a run: of 1,950 starts the first 20
-have 30 % of the sums. They have as much in the skill, which is a ratio of sums. On validation runs
-of InvertedPendulum, AR(20) by phase, skill at h = 1, 5, 10, 50 (mean of the starts' own skills
-behind the slash): 0.41/0.36, 0.31/0.18, 0.23/0.05, 0.11/-0.02. With starts divided by their mean
-squared step it is 0.33/0.39, 0.28/0.19, 0.21/0.09, 0.09/0.03: better start by start, worse in the
-sum, at every horizon; the same for the last step and for AR(20). We fit what is evaluated.
+Starts are not weighted. Steps shrink up to 400 times over a run, so the first 20 of 1,950 starts
+have 30 % of the sums; and as much in the skill, which is a ratio of sums. On validation runs of
+InvertedPendulum, AR(20) by phase, skill at h = 1, 5, 10, 50 (behind the slash the mean of the
+starts' own skills): 0.41/0.36, 0.31/0.18, 0.23/0.05, 0.11/-0.02. With starts divided by their mean
+squared step: 0.33/0.39, 0.28/0.19, 0.21/0.09, 0.09/0.03, which is better start by start and worse
+in the sum; the same for the last step and for AR(20). We fit what is evaluated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,11 @@ from tipl.horizons import HORIZONS, fitted, rows_of
 from tipl.models.baselines.catalogue import features_of
 from tipl.models.baselines.data import Trajectory, samples, thinned
 from tipl.models.baselines.features import Features
-from tipl.saved import broken, read_arrays, read_config, write
+from tipl.saved import read_arrays, read_config, write
 from weighttraj import Run
 
 MAX_STARTS = 2000
-"""Starts of a run that a fit looks at."""
+"""Number of starts of a run that a fit looks at."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,19 +47,18 @@ class Regression(Forecaster):
     """Forecasts by fitted coefficients."""
 
     features: Features
-    """What of the past is looked at."""
+    """What the regression sees of the past."""
     horizons: tuple[int, ...]
     """Horizons that it was fitted for, rising."""
     phases: tuple[int, ...] | None
-    """Parts of the iteration that have coefficients of their own; None: all have the same."""
+    """Parts of the iteration with separate coefficients; None: all have the same."""
     coefficients: Float64[np.ndarray, "phase horizon feature"]
     """c; one phase if all have the same."""
     kind = "regression"
-    causal = True
 
     @property
     def name(self) -> str:
-        """Name in tables and figures; of one feature the fit is a factor, which shrinks it."""
+        """Name in tables and figures. The fit of one feature is a factor, which shrinks it."""
         name = self.features.name + ("-shrunk" if self.features.size == 1 else "")
         return name if self.phases is None else f"{name}-phase"
 
@@ -77,10 +76,10 @@ class Regression(Forecaster):
 
         Args:
             runs: training runs.
-            features: what of the past is looked at.
-            by_phase: fit coefficients for each part of the iteration.
-            horizons: how far to look.
-            seed: of the sample of parameters and starts, if runs are large.
+            features: what the regression sees of the past.
+            by_phase: fit separate coefficients for each part of the iteration.
+            horizons: numbers of snapshots ahead.
+            seed: seed of the sample of parameters and starts of large runs.
 
         Raises:
             TrainError: the runs are too short.
@@ -93,11 +92,7 @@ class Regression(Forecaster):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t + c x.
-
-        Raises:
-            ForecastError: it was not fitted for such a horizon or phase.
-        """
+        """Return phi_t + c x."""
         check_request(run, starts, horizons)
         rows = rows_of(self.horizons, horizons, self.name)
         trajectory = Trajectory.of(run)
@@ -108,7 +103,7 @@ class Regression(Forecaster):
         return out
 
     def _groups(self, trajectory: Trajectory, starts: Sequence[int], run: Run) -> list[int]:
-        """Which coefficients each start takes. phi_0 has no phase, and no past to multiply."""
+        """Return which coefficients each start takes; phi_0 has no phase, and features of 0."""
         if self.phases is None:
             return [0] * len(starts)
         phases = trajectory.phase[np.asarray(starts)].tolist()
@@ -136,17 +131,9 @@ class Regression(Forecaster):
 
     @classmethod
     def load(cls, path: str | Path) -> Regression:
-        """Read a saved one.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the files are another's, or damaged.
-        """
+        """Read a saved one."""
         config = read_config(path, cls.kind, _Config)
-        try:
-            features = features_of(config.features)
-        except ValueError as error:
-            raise broken(path, error) from error
+        features = features_of(config.features, path)
         groups = 1 if config.phases is None else len(config.phases)
         shape = (groups, len(config.horizons), features.size)
         arrays = read_arrays(path, {"coefficients": shape})
@@ -154,13 +141,9 @@ class Regression(Forecaster):
 
 
 class RegressionFit:
-    """A fit that takes one run after the other: it keeps sums of products only.
+    """A fit that takes one run after the other and only keeps sums of products.
 
-    Args:
-        features: what of the past is looked at.
-        by_phase: fit coefficients for each part of the iteration.
-        horizons: how far to look.
-        seed: of the sample of starts.
+    The arguments are those of ``Regression.fit``.
     """
 
     def __init__(
@@ -176,13 +159,8 @@ class RegressionFit:
         self._rng = np.random.default_rng(seed)
         self._sums: dict[int, _Sums] = {}
 
-    @property
-    def name(self) -> str:
-        """Of what comes out."""
-        return self._with(np.zeros((0, 0, 0))).name
-
     def add(self, trajectory: Trajectory) -> None:
-        """Look at one run."""
+        """Add the sums of one run."""
         first = int(self._by_phase)  # phi_0 has no phase
         starts, counts = thinned(len(trajectory) - first - self._horizons[0], MAX_STARTS, self._rng)
         starts = starts + first
@@ -199,7 +177,7 @@ class RegressionFit:
             sums.add(features, moved, trajectory.importance * counts[place])
 
     def finish(self) -> Regression:
-        """What was fitted.
+        """Return the regression.
 
         Raises:
             TrainError: no run was long enough.
@@ -213,15 +191,11 @@ class RegressionFit:
                 got=f"starts for each phase and horizon: {counts.tolist()}",
                 do="fit fewer horizons, or collect longer runs",
             )
-        return self._with(np.stack([self._sums[phase].solve() for phase in phases]))
-
-    def _with(self, coefficients: np.ndarray) -> Regression:
-        phases = tuple(sorted(self._sums)) if self._by_phase else None
         return Regression(
             features=self._features,
             horizons=self._horizons,
-            phases=phases,
-            coefficients=coefficients,
+            phases=phases if self._by_phase else None,
+            coefficients=np.stack([self._sums[phase].solve() for phase in phases]),
         )
 
 
@@ -231,7 +205,7 @@ class _Sums:
 
     left: Float64[np.ndarray, "horizon feature feature"]
     right: Float64[np.ndarray, "horizon feature"]
-    count: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    count: np.ndarray
 
     @classmethod
     def zero(cls, horizons: int, size: int) -> _Sums:

@@ -1,20 +1,18 @@
-"""Forecasts in few directions that are found in the observed past: a causal SVD, and DMD."""
+"""Forecasts in few directions of the observed past: a causal SVD, and DMD."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float32, Float64
 
-from tipl.forecaster import Forecaster, check_request
+from tipl.forecaster import check_request
 from tipl.models.baselines.data import Trajectory, renewal
-from tipl.models.baselines.features import Features, Inputs
-from tipl.models.baselines.steps import last_steps
+from tipl.models.baselines.features import Features, Inputs, last_steps
 from tipl.runs import Rows
-from tipl.saved import read_config, write
+from tipl.saved import SavedSettings
 from weighttraj import Run
 
 MAX_ROWS = 256
@@ -24,20 +22,15 @@ MAX_ROWS = 256
 def prefix_basis(
     weights: Rows, last: int, rank: int, scale: Float64[np.ndarray, " param"]
 ) -> Float64[np.ndarray, "direction param"]:
-    """Orthonormal directions along which a run moved most up to a snapshot.
+    """Return the orthonormal directions along which a run moved most up to a snapshot.
 
-    These are the first right singular vectors of phi_s - phi_last, s = 0, ..., last.
-
-    Args:
-        weights: (time, param).
-        last: the last snapshot that is looked at.
-        rank: directions, at most; there are fewer if the run moved in fewer.
-        scale: what each parameter is multiplied by.
+    These are the first right singular vectors of scale * (phi_s - phi_last), s = 0, ..., last;
+    fewer than the rank if the run moved in fewer.
     """
     rows = np.unique(np.linspace(0, last, min(last + 1, MAX_ROWS)).round().astype(int))
     moved = np.asarray(weights[rows], np.float64)
     moved = (moved - moved[-1]) * scale
-    # from the small matrix of products: time and memory grow with the parameters, not squared
+    # The matrix (snapshot, snapshot) of products is small, however many parameters there are.
     squared, left = np.linalg.eigh(moved @ moved.T)
     kept = squared[::-1][:rank] > 1e-10 * max(squared[-1], np.finfo(float).tiny)
     squared, left = squared[::-1][:rank][kept], left[:, ::-1][:, :rank][:, kept]
@@ -46,29 +39,29 @@ def prefix_basis(
 
 @dataclass(frozen=True)
 class ProjectedSteps(Features):
-    """The last steps as a model sees them that works on coefficients of a causal SVD.
+    """The last steps, projected onto a basis of the past at the last ``renewal``.
 
-    The basis is of the past at the last ``renewal``. A step is replaced by its projection.
+    A model that works on coefficients of a causal SVD sees the same.
     """
 
     lags: int = 20
-    """How many steps."""
+    """Number of steps."""
     rank: int = 32
-    """Directions of the basis; as many as TIPL's coefficients."""
+    """Number of directions of the basis: as many as TIPL has coefficients."""
     kind = "projected-steps"
 
     @property
     def name(self) -> str:
-        """AR in the space of the SVD."""
+        """``ar-20-svd``, for example."""
         return f"ar-{self.lags}-svd"
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """Number of features."""
         return self.lags
 
     def __call__(self, trajectory: Trajectory, starts: Sequence[int]) -> Iterator[Inputs]:
-        """The features of each start; 0 for phi_0."""
+        """Yield the features of each start."""
         found, scale = -1, np.sqrt(trajectory.importance)
         basis = np.zeros((0, len(scale)))
         for place, window in trajectory.windows(starts, self.lags):
@@ -80,33 +73,32 @@ class ProjectedSteps(Features):
 
 
 @dataclass(frozen=True)
-class DMD(Forecaster):
+class DMD(SavedSettings):
     """Dynamic mode decomposition of the last steps: d_{t+1} = A d_t with A of low rank.
 
     After Schmid, "Dynamic mode decomposition of numerical and experimental data" (J. Fluid Mech.
     656, 2010). A is the least-squares operator on the first singular directions of the window, and
-    the forecast adds up A d_t, A^2 d_t, .... Eigenvalues outside the unit disc are drawn to its
+    the forecast adds up A d_t, A^2 d_t, .... Eigenvalues outside the unit disc are moved to its
     edge: without that the error at h = 50 is 1e58 times that of persistence.
 
-    Ours: steps instead of weights, so that a straight line is a fixed point and the origin doesn't
-    matter; 50 steps, rank 2. On some validation runs of InvertedPendulum that loses least (skill
-    0.00, -0.01, -0.04 at h = 1, 5, 10; rank 5: -0.06, -0.05, -0.14; weights instead of steps, rank
-    5: -0.13, -0.26, -0.50). Nothing is fitted to other runs; the null test passes all the same, as
-    the steps of a random walk in 122 dimensions are nearly orthogonal and A is nearly 0.
+    Ours: steps instead of weights, so that a straight line is a fixed point and the origin does
+    not matter; 50 steps, rank 2, which loses least on some validation runs of InvertedPendulum
+    (skill 0.00, -0.01, -0.04 at h = 1, 5, 10; rank 5: -0.06, -0.05, -0.14; weights instead of
+    steps, rank 5: -0.13, -0.26, -0.50). The null test passes although nothing is fitted: the steps
+    of a random walk in 122 dimensions are nearly orthogonal, so A is nearly 0.
     """
 
     window: int = 50
-    """Steps that the operator is fitted to."""
+    """Number of steps that the operator is fitted to."""
     rank: int = 2
-    """Directions."""
+    """Number of directions."""
     kind = "dmd"
     name = "dmd"
-    causal = True
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """phi_t + A d_t + ... + A^h d_t."""
+        """Return phi_t + A d_t + ... + A^h d_t."""
         check_request(run, starts, horizons)
         out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
         for place, window in Trajectory.of(run).windows(starts, self.window):
@@ -117,17 +109,12 @@ class DMD(Forecaster):
     def _combination(
         self, products: Float64[np.ndarray, "step step"], horizons: Sequence[int]
     ) -> Float64[np.ndarray, "horizon step"]:
-        """The displacement at each horizon as a combination of the window's steps.
-
-        Args:
-            products: inner products of the steps.
-            horizons: how far to look.
-        """
+        """Return the displacement at each horizon as a combination of the window's steps."""
         n = len(products) - 1
         combination = np.zeros((len(horizons), n + 1))
         if n < 1 or products[-1, -1] == 0:
             return combination
-        # X = U S V^T: all steps but the last, as columns; A maps X to all steps but the first
+        # X = U S V^T holds all steps but the last as columns; A maps it to all steps but the first.
         squared, right = np.linalg.eigh(products[:-1, :-1])
         squared, right = squared[::-1][: self.rank], right[:, ::-1][:, : self.rank]
         kept = squared > 1e-12 * max(squared[0], np.finfo(float).tiny)
@@ -139,24 +126,10 @@ class DMD(Forecaster):
         combination[:, :-1] = (modes @ vectors.T).real @ back.T
         return combination
 
-    def save(self, path: str | Path) -> None:
-        """Write config.json; there is nothing fitted."""
-        write(path, {"kind": self.kind, **asdict(self)})
-
-    @classmethod
-    def load(cls, path: str | Path) -> DMD:
-        """Read the settings.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the folder holds another one.
-        """
-        return read_config(path, cls.kind, cls)
-
 
 def _sums(
     values: Complex[np.ndarray, " mode"], horizons: Sequence[int]
 ) -> Complex[np.ndarray, "horizon mode"]:
-    """x + x^2 + ... + x^h of each eigenvalue."""
+    """Return x + x^2 + ... + x^h of each eigenvalue."""
     powers = values[None] ** np.arange(1, max(horizons) + 1)[:, None]
     return np.asarray(powers.cumsum(0)[np.asarray(horizons) - 1])

@@ -16,15 +16,13 @@ from tipl.errors import TrainError
 from tipl.forecaster import Forecaster
 from tipl.horizons import HORIZONS, fitted
 from tipl.models.baselines.data import samples
-from tipl.models.baselines.endpoints import EndPoints
-from tipl.models.baselines.features import Features
+from tipl.models.baselines.features import Ema, EndPoints, Features, Steps
 from tipl.models.baselines.modes import ModeSteps
+from tipl.models.baselines.naive import BETAS, UNFITTED
 from tipl.models.baselines.nowcaster import LOOP, Nowcaster, NowcasterConfig, NowcasterFit
 from tipl.models.baselines.nowcasters import WNN, NinoMLP
 from tipl.models.baselines.regression import Regression, RegressionFit
-from tipl.models.baselines.steps import Ema, Steps
 from tipl.models.baselines.subspace import ProjectedSteps
-from tipl.models.baselines.unfitted import BETAS, UNFITTED
 from tipl.runs import checksum_of
 from tipl.settings import check_settings
 from tipl.training import LoopConfig
@@ -99,8 +97,8 @@ def fit_baselines(
     Args:
         runs: training runs.
         validation_runs: other runs; of each small network the state that does best on them is
-            kept. Nothing else looks at them.
-        horizons: how far the fitted ones look.
+            kept.
+        horizons: numbers of snapshots ahead of the fitted ones.
         seed: seed of samples and trainings.
         progress: progress callback, called with a line of text.
         training: how the small networks are trained; None: as they are by default.
@@ -131,7 +129,7 @@ def fit_baselines(
     baselines = list(UNFITTED)
     for fitting in fittings:
         baselines.append(fitting.finish())
-        say(f"fitted {fitting.name}")
+        say(f"fitted {baselines[-1].name}")
     return baselines
 
 

@@ -50,14 +50,7 @@ class CausalExamples(StartExamples):
 def examples_of(
     run: Run, config: CausalConfig, count: int, rng: np.random.Generator
 ) -> Iterator[Example]:
-    """Yield the examples of a run.
-
-    Args:
-        run: the run.
-        config: sizes of the network.
-        count: number of starts, about.
-        rng: draws starts and parameters.
-    """
+    """Yield about ``count`` examples of a run."""
     clock = Clock.of(run)
     columns, counts = stratified(Structure.of(run.layout).tensor.numpy(), POOL, rng)
     weights = columns_of(weights_of(run), columns).astype(np.float64)
@@ -101,12 +94,7 @@ def _followed(
 def view(prefix: PrefixTokens, t: int, scale: float, clock: Clock, config: CausalConfig) -> Example:
     """Return what the network sees at t: tokens, phases, mask and state.
 
-    Args:
-        prefix: coefficients of the run around t.
-        t: the start.
-        scale: RMS norm of the last steps.
-        clock: phases and learning rates.
-        config: sizes of the network.
+    ``scale`` is the RMS norm of the last steps, the unit of length.
     """
     count = min(config.block_size, t - prefix.first + 1)
     values = prefix.singular_values / scale
@@ -115,13 +103,11 @@ def view(prefix: PrefixTokens, t: int, scale: float, clock: Clock, config: Causa
     tokens[-count:] = prefix.coefficients[end - count : end] * values
     phases = np.zeros(config.block_size, np.int64)
     phases[-count:] = clock.phase[t - count + 1 : t + 1] + 1
-    rate = float(clock.rate[t])
-    time = [np.log1p(t) / 4, rate, np.log(rate + 1e-3) / 3]
     return {
         "tokens": torch.from_numpy(tokens),
         "phases": torch.from_numpy(phases),
         "mask": torch.arange(config.block_size) >= config.block_size - count,
-        "state": torch.tensor([*np.log(values + 1e-6), *time], dtype=torch.float32),
+        "state": torch.tensor([*np.log(values + 1e-6), *clock.numbers(t)], dtype=torch.float32),
     }
 
 

@@ -15,20 +15,15 @@ from tipl.horizons import rows_of
 from tipl.models.causal.data import SCALE_STEPS, bases_of, local_scale, view
 from tipl.models.causal.network import CausalConfig, CausalGPT
 from tipl.runs import weights_of
-from tipl.saved import SavedNetwork
+from tipl.saved import ModelConfig, SavedNetwork
 from tipl.structure import Clock
 from tipl.threads import threads
 from weighttraj import Run
 
 
 @dataclass(frozen=True, kw_only=True)
-class CausalModelConfig:
-    """What a saved one says of itself."""
-
-    network: CausalConfig
-    """Sizes of the network."""
-    every: int | None
-    """Gradient steps from one snapshot to the next in the training runs."""
+class CausalModelConfig(ModelConfig[CausalConfig]):
+    """What a saved tipl-causal says of itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +49,7 @@ class Causal(SavedNetwork[CausalGPT, CausalModelConfig]):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and what the network adds to it.
-
-        Raises:
-            ForecastError: it was not trained for such a horizon.
-            ModelError: the run has another cadence, or longer iterations.
-        """
+        """Return phi_t and what the network adds to it."""
         check_request(run, starts, horizons)
         sizes, weights = self.config.network, weights_of(run)
         places = rows_of(sizes.horizons, horizons, self.name)

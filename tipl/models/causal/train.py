@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,16 +12,14 @@ from rich.console import Console
 from torch import Tensor
 
 import weighttraj as wt
-from tipl.checks.copies import RefitConfig, as_dataset
+from tipl.checks.copies import RefitConfig, refit_settings
 from tipl.errors import TrainError
-from tipl.horizons import fitted
 from tipl.models.causal.data import CausalExamples, examples_of
-from tipl.models.causal.forecaster import Causal, CausalModelConfig
+from tipl.models.causal.forecaster import Causal
 from tipl.models.causal.network import CausalConfig, CausalGPT
 from tipl.settings import check_heads, check_settings
-from tipl.training import LoopConfig, train_network
-from tipl.training.config import flat
-from tipl.training.starts import Example, StartsConfig, StartsLearner
+from tipl.training import LoopConfig
+from tipl.training.starts import Example, StartsConfig, StartsLearner, train_on_starts
 
 NETWORK = CausalConfig()
 LOOP = LoopConfig(n_batches=4_000, batch_size=64, learning_rate=1e-3)
@@ -46,40 +43,11 @@ class CausalTrainConfig(StartsConfig):
         check_heads(self.network.n_embd, self.network.n_head, TrainError)
 
 
-def train_causal(config: CausalTrainConfig, *, console: Console | None = None) -> Causal:
-    """Train tipl-causal, or go on where the training stopped; load it if the training has ended.
-
-    Raises:
-        TrainError: the data sets have no runs to train on, or different cadences; or as
-            ``train_network``.
-        RepresentationError: a run has too few directions.
-    """
-    config.check()
-    train_network(
-        lambda *_: CausalLearner(config),
-        config.training,
-        config.out,
-        CausalLearner.settings,
-        defaults=flat(config),
-        console=console,
-    )
-    return Causal.load(config.out)
-
-
 class CausalLearner(StartsLearner[CausalExamples]):
     """The network of tipl-causal, its examples and its loss."""
 
+    model = Causal
     network: CausalGPT
-
-    def __init__(self, config: CausalTrainConfig) -> None:
-        super().__init__(config, fitted(config.network.horizons))
-        sizes = replace(
-            config.network,
-            horizons=fitted(config.network.horizons),
-            phases=config.network.phases or self.phases,
-        )
-        self.model_config = CausalModelConfig(network=sizes, every=self.every)
-        self.network = CausalGPT(sizes)
 
     def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
         """Return the examples of one run."""
@@ -101,27 +69,19 @@ class CausalLearner(StartsLearner[CausalExamples]):
         ratio = ((moved - batch.target).square().sum(2) + outside) / energy  # (start, horizon)
         return (ratio * known).sum(), known.sum().clamp(min=1)
 
-    def save(self, out: Path) -> None:
-        """Write the model."""
-        Causal(self.network, self.model_config).save(out)
+
+def train_causal(config: CausalTrainConfig, *, console: Console | None = None) -> Causal:
+    """Train tipl-causal, or go on where the training stopped; load it if the training has ended.
+
+    Raises:
+        TrainError: the data sets have no runs to train on, or different cadences; or as
+            ``train_network``.
+        RepresentationError: a run has too few directions.
+    """
+    train_on_starts(CausalLearner, config, console)
+    return Causal.load(config.out)
 
 
 def refit(old: Causal, runs: Sequence[wt.Run], config: RefitConfig) -> Causal:
-    """Train a Transformer of the same sizes on other runs, for the null check.
-
-    A quarter of the runs choose which state is kept.
-    """
-    loop = replace(
-        LOOP,
-        n_batches=config.batches,
-        save_every=max(1, config.batches // 20),
-        seed=config.seed,
-    )
-    return train_causal(
-        CausalTrainConfig(
-            data=(as_dataset(runs, config.folder / "walks", validation=len(runs) // 4),),
-            out=config.folder / "refit",
-            network=replace(old.config.network, horizons=config.horizons, phases=0),
-            training=loop,
-        )
-    )
+    """Train a Transformer of the same sizes on other runs, for the null check."""
+    return train_causal(refit_settings(CausalTrainConfig, LOOP, old.config.network, runs, config))

@@ -57,14 +57,7 @@ class GateExamples(StartExamples):
 def examples_of(
     run: Run, config: GateConfig, count: int, rng: np.random.Generator
 ) -> Iterator[Example]:
-    """Yield the examples of a run.
-
-    Args:
-        run: the run.
-        config: sizes of the network.
-        count: number of starts, about.
-        rng: draws starts and parameters.
-    """
+    """Yield about ``count`` examples of a run."""
     structure, clock = Structure.of(run.layout), Clock.of(run)
     columns, counts = stratified(structure.tensor.numpy(), POOL, rng)
     pool = _Pool(columns, counts, columns_of(weights_of(run), columns))

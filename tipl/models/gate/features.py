@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -217,9 +216,7 @@ def _of_adam(
 
 def _time(clock: Clock, t: int, phases: int) -> Float[Tensor, " number"]:
     phase = one_hot(torch.tensor(int(clock.phase[t]) + 1), phases + 1).float()
-    rate = float(clock.rate[t])
-    rest = torch.tensor([np.log1p(t) / 4, rate, np.log(rate + 1e-3) / 3], dtype=torch.float32)
-    return torch.cat([phase, rest])
+    return torch.cat([phase, torch.tensor(clock.numbers(t), dtype=torch.float32)])
 
 
 def _log_ratio(squared: Tensor, scale: Tensor) -> Tensor:

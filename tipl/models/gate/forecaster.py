@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,28 +17,15 @@ from tipl.models.gate.adam import AdamReader
 from tipl.models.gate.features import Features, features, pieces
 from tipl.models.gate.history import histories
 from tipl.models.gate.network import GateConfig, GateNetwork
-from tipl.saved import SavedNetwork
+from tipl.saved import ModelConfig, SavedNetwork
 from tipl.structure import Clock, Structure
 from tipl.threads import threads
 from weighttraj import Run
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateModelConfig:
-    """What a saved one says of itself."""
-
-    network: GateConfig
-    """Sizes of the network."""
-    every: int | None
-    """Gradient steps from one snapshot to the next in the training runs."""
-
-    def told(self) -> dict[str, Any]:
-        """Return the fields that are written; settings that are rarely used are left out."""
-        found = asdict(self)
-        for name in ("without", "adam"):
-            if not getattr(self.network, name):
-                del found["network"][name]
-        return found
+class GateModelConfig(ModelConfig[GateConfig]):
+    """What a saved tipl-gate says of itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,18 +47,17 @@ class Gate(SavedNetwork[GateNetwork, GateModelConfig]):
         return GateNetwork(config.network)
 
     def document(self) -> dict[str, Any]:
-        """Return what config.json says."""
-        return {"kind": self.kind, **self.config.told()}
+        """Return what config.json says; settings that are rarely used are left out."""
+        found = super().document()
+        for name in ("without", "adam"):
+            if not found["network"][name]:
+                del found["network"][name]
+        return found
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and what the network adds to it.
-
-        Raises:
-            ForecastError: it was not trained for such a horizon.
-            ModelError: the run has another cadence, or longer iterations.
-        """
+        """Return phi_t and what the network adds to it."""
         out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
         for place, weights, moved in self.moves(run, starts, horizons):
             out[place] = weights + moved
@@ -80,12 +66,7 @@ class Gate(SavedNetwork[GateNetwork, GateModelConfig]):
     def moves(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Iterator[tuple[int, Float32[np.ndarray, " param"], Float32[np.ndarray, "horizon param"]]]:
-        """Yield the forecast in parts: the place of each start, phi_t, and what is added to it.
-
-        Raises:
-            ForecastError: it was not trained for such a horizon.
-            ModelError: the run has another cadence, or longer iterations.
-        """
+        """Yield the forecast in parts: the place of each start, phi_t, and what is added to it."""
         check_request(run, starts, horizons)
         sizes = self.config.network
         rows = rows_of(sizes.horizons, horizons, self.name)
@@ -104,13 +85,7 @@ class Gate(SavedNetwork[GateNetwork, GateModelConfig]):
     def displacements(
         self, seen: Features, structure: Structure, rows: list[int]
     ) -> Float[Tensor, "horizon param"]:
-        """Return what is added to the weights.
-
-        Args:
-            seen: at the start.
-            structure: of the policy.
-            rows: places of the wanted horizons among those of the network.
-        """
+        """Return what is added to the weights; ``rows`` are places of horizons in the network."""
         parts = []
         for number, part in enumerate(structure.slices):
             for some in pieces(part):

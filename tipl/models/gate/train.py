@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,16 +12,14 @@ from rich.console import Console
 from torch import Tensor
 
 import weighttraj as wt
-from tipl.checks.copies import RefitConfig, as_dataset
+from tipl.checks.copies import RefitConfig, refit_settings
 from tipl.errors import TrainError
-from tipl.horizons import fitted
 from tipl.models.gate.data import GateExamples, examples_of
-from tipl.models.gate.forecaster import Gate, GateModelConfig
+from tipl.models.gate.forecaster import Gate
 from tipl.models.gate.network import GateConfig, GateNetwork
 from tipl.settings import check_settings
-from tipl.training import LoopConfig, train_network
-from tipl.training.config import flat
-from tipl.training.starts import Example, StartsConfig, StartsLearner
+from tipl.training import LoopConfig
+from tipl.training.starts import Example, StartsConfig, StartsLearner, train_on_starts
 
 NETWORK = GateConfig()
 LOOP = LoopConfig(n_batches=4_000, batch_size=32, learning_rate=3e-3)
@@ -52,41 +49,11 @@ class GateTrainConfig(StartsConfig):
             )
 
 
-def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
-    """Train tipl-gate, or go on where the training stopped; load it if the training has ended.
-
-    The same seed gives the same model on the same machine.
-
-    Raises:
-        TrainError: the data sets have no runs to train on, or different cadences; or as
-            ``train_network``.
-    """
-    config.check()
-    train_network(
-        lambda *_: GateLearner(config),
-        config.training,
-        config.out,
-        GateLearner.settings,
-        defaults=flat(config),
-        console=console,
-    )
-    return Gate.load(config.out)
-
-
 class GateLearner(StartsLearner[GateExamples]):
     """The network of tipl-gate, its examples and its loss."""
 
+    model = Gate
     network: GateNetwork
-
-    def __init__(self, config: GateTrainConfig) -> None:
-        super().__init__(config, fitted(config.network.horizons))
-        sizes = replace(
-            config.network,
-            horizons=fitted(config.network.horizons),
-            phases=config.network.phases or self.phases,
-        )
-        self.model_config = GateModelConfig(network=sizes, every=self.every)
-        self.network = GateNetwork(sizes)
 
     def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
         """Return the examples of one run."""
@@ -102,9 +69,18 @@ class GateLearner(StartsLearner[GateExamples]):
         """Return the summed relative error, and the number of known cells."""
         return relative_error(network, batch)
 
-    def save(self, out: Path) -> None:
-        """Write the model."""
-        Gate(self.network, self.model_config).save(out)
+
+def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
+    """Train tipl-gate, or go on where the training stopped; load it if the training has ended.
+
+    The same seed gives the same model on the same machine.
+
+    Raises:
+        TrainError: the data sets have no runs to train on, or different cadences; or as
+            ``train_network``.
+    """
+    train_on_starts(GateLearner, config, console)
+    return Gate.load(config.out)
 
 
 def relative_error(
@@ -113,7 +89,7 @@ def relative_error(
     """Return squared error over mean squared displacement, summed over starts and horizons.
 
     Returns:
-        the sum, and how many starts and horizons are known.
+        The sum, and how many starts and horizons are known.
     """
     moved = network(
         examples.inputs.float(), examples.contexts.float(), examples.basis.float(), examples.tensor
@@ -126,22 +102,5 @@ def relative_error(
 
 
 def refit(old: Gate, runs: Sequence[wt.Run], config: RefitConfig) -> Gate:
-    """Train a network of the same sizes on other runs, for the null check.
-
-    A quarter of the runs choose which state is kept.
-    """
-    loop = replace(
-        LOOP,
-        n_batches=config.batches,
-        save_every=max(1, config.batches // 20),
-        seed=config.seed,
-    )
-    network = replace(old.config.network, horizons=config.horizons, phases=0)
-    return train_gate(
-        GateTrainConfig(
-            data=(as_dataset(runs, config.folder / "walks", validation=len(runs) // 4),),
-            out=config.folder / "refit",
-            network=network,
-            training=loop,
-        )
-    )
+    """Train a network of the same sizes on other runs, for the null check."""
+    return train_gate(refit_settings(GateTrainConfig, LOOP, old.config.network, runs, config))

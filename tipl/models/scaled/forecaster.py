@@ -16,18 +16,14 @@ from tipl.models.gate.forecaster import Gate, GateModelConfig
 from tipl.models.gate.network import GateConfig
 from tipl.registry import load_folder
 from tipl.runs import weights_of
-from tipl.saved import ARRAYS, broken, load_network, read_config, write
+from tipl.saved import ARRAYS, ModelConfig, broken, load_network, read_config, write
 from weighttraj import ParamLayout, Run
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaledGateConfig:
+class ScaledGateConfig(ModelConfig[GateConfig]):
     """What a saved one says of itself."""
 
-    network: GateConfig
-    """Sizes of the network."""
-    every: int | None
-    """Gradient steps from one snapshot to the next in the training runs."""
     amplitudes: dict[str, float]
     """Factor of the displacement at each horizon. JSON has no numbers as keys."""
 
@@ -70,7 +66,7 @@ class ScaledGate(Forecaster):
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""
         amplitudes = {str(h): a for h, a in self.amplitudes.items()}
-        write(path, {"kind": self.kind, **self.gate.config.told(), "amplitudes": amplitudes})
+        write(path, {**self.gate.document(), "kind": self.kind, "amplitudes": amplitudes})
         save_file(self.gate.network.state_dict(), Path(path) / ARRAYS)
 
     @classmethod
