@@ -28,6 +28,7 @@ from tipl import (
     train,
 )
 from tipl.checks.results import read_checks
+from tipl.commands.zoo import listed
 from tipl.errors import EvaluateError, ForecastError, ModelError
 from tipl.evaluation.results import read_results
 from tipl.models.baselines import Extrapolation, Slope
@@ -40,7 +41,6 @@ from tipl.report.markdown import places
 from tipl.report.scores import SKILL
 from tipl.saved import fingerprint
 from tipl.zoo.card import facts, metrics_of, refreshed, write_card
-from tipl.zoo.listing import listed
 from tipl.zoo.metrics import read_metrics
 from tipl.zoo.release import LINES, MOST, release, thinned
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info

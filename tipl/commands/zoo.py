@@ -8,11 +8,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from tipl import registry
-from tipl.zoo.listing import HEADLINE, listed
+from tipl.report.scores import GAIN, SKILL, row_at
+from tipl.report.tables import cell
+from tipl.zoo.metrics import read_metrics
 from weighttraj.terminal import Output
 
 WIDE = 150
 """Number of characters that a table with intervals needs."""
+HEADLINE = {
+    "skill, h = 1": (SKILL, 1),
+    "skill, h = 10": (SKILL, 10),
+    "gain, h = 50": (GAIN, 50),
+}
+"""Columns that sum a model up: a figure and its horizon."""
 
 
 def zoo() -> None:
@@ -29,3 +37,15 @@ def zoo() -> None:
         cells = zip(listed(name, interval=wide), columns.values(), strict=True)
         table.add_row(*(escape(text) for text, shown in cells if shown))
     console.print(table)
+
+
+def listed(name: str, *, interval: bool = True) -> tuple[str, ...]:
+    """Return a line of ``tipl zoo``: name, kind, causal, data set, and ``HEADLINE`` figures."""
+    folder = registry.MODELS / name
+    metrics = read_metrics(folder)
+    if metrics is None:
+        return (name, registry.kind_in(folder), *["-"] * (2 + len(HEADLINE)))
+    rows = [row_at(metrics.scores, measure, h) for measure, h in HEADLINE.values()]
+    figures = [cell(row, interval=interval) for row in rows]
+    causal = "yes" if metrics.causal else "no"
+    return (name, metrics.kind, causal, metrics.results.data, *figures)

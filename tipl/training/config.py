@@ -108,6 +108,11 @@ def flat(config: Any) -> dict[str, Any]:
     return found
 
 
+def defaults_of(config: Any) -> dict[str, Any]:
+    """Return the settings of a config of the same type in which only data and folder are given."""
+    return flat(type(config)(data=config.data, out=config.out))
+
+
 def change(config: C, **settings: Any) -> C:
     """Return a config with some settings changed, which are named as the command's options are.
 

@@ -39,7 +39,6 @@ from tipl.training.parallel import Ranks, device_here, open_ranks
 from tipl.training.progress import TrainingBar
 
 E = TypeVar("E", bound="Examples")
-L = TypeVar("L", bound="Learner[Any]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +60,16 @@ class Examples:
 
 
 class Learner(ABC, Generic[E]):
-    """A network, its batches and its loss: what the loop trains.
-
-    ``tipl`` makes one for each kind of model; a model from outside may, too.
-    """
+    """A network, its batches and its loss: what the loop trains. Each kind of model has its own."""
 
     network: nn.Module
     """The network, as it is before training."""
     measure: ClassVar[str] = "error"
     """What the loss is called in the log."""
+
+    def settings(self) -> Mapping[str, Any] | None:
+        """Return all settings of the training, for ``train.json``; None: those of the loop."""
+        return None
 
     def prepare(self, console: Console) -> None:
         """Read the examples. Called once, before the first batch; not if the training has ended."""
@@ -99,10 +99,9 @@ class Learner(ABC, Generic[E]):
 
 
 def train_network(
-    build: Callable[[Ranks, Console], L],
+    build: Callable[[Ranks], Learner[Any]],
     config: LoopConfig,
     out: Path,
-    settings: Callable[[L], Mapping[str, Any]] | None = None,
     *,
     defaults: Mapping[str, Any] | None = None,
     console: Console | None = None,
@@ -110,11 +109,10 @@ def train_network(
     """Train a network, or go on where its training stopped; do nothing if it has ended.
 
     Args:
-        build: makes what is trained; it is told of the processes that train together.
+        build: returns what is trained, given the processes that train together.
         config: how long and how.
         out: folder of the model.
-        settings: returns all settings of the training, for ``train.json``; None: those of the loop.
-        defaults: values of settings that earlier trainings did not have.
+        defaults: default settings, for those that an older training in the folder did not have.
         console: where progress is shown; None: nowhere.
 
     Raises:
@@ -130,10 +128,10 @@ def train_network(
     ):
         shown = (console if ranks.first else None) or quiet
         torch.manual_seed(config.seed)
-        learner = build(ranks, shown)
-        told = settings(learner) if settings else vars(config)
+        learner = build(ranks)
+        settings = learner.settings() or vars(config)
         loop = _Loop(learner, config, out, ranks, shown)
-        ranks.from_first(lambda: keep_settings(out, told, config.may_differ, defaults))
+        ranks.from_first(lambda: keep_settings(out, settings, config.may_differ, defaults))
         loop.run()
         ranks.from_first(lambda: None)  # the model is there when any process returns
         # The gradients' reducer holds the group of processes. If it outlives the group's end, torch
@@ -186,11 +184,11 @@ class _Loop(Generic[E]):
             total, count = 0.0, 0
             for n in range(start, config.n_batches):
                 total, count = total + self.step(n), count + 1
-                bar.advance(total / count)
+                bar.count(total / count)
                 if (n + 1) % config.save_every == 0 or n + 1 == config.n_batches:
                     line = {learner.measure: total / count, "batches_per_s": bar.speed}
                     self._look(n + 1, line)
-                    bar.restart()
+                    bar.measure_again()
                     total, count = 0.0, 0
 
     def step(self, n: int) -> float:

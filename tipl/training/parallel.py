@@ -22,9 +22,9 @@ from torch import Tensor
 from tipl.errors import TrainError
 
 if dist.is_available():
-    # Its functions take the group that there is when it is imported as a default argument. Torch
-    # imports it with the first optimizer; were that after the start of a group, the threads of the
-    # group would outlive it, and now and then abort the process at its end.
+    # On import, default arguments of its functions keep the group of that time. Torch imports it
+    # with the first optimizer. If a group had started by then, its threads would outlive it, and
+    # sometimes abort the process at its end.
     import torch.distributed.nn.functional
 
 T = TypeVar("T")
@@ -40,7 +40,7 @@ class Ranks:
     rank: int = 0
     """Number of this process, from 0."""
     world: int = 1
-    """How many there are."""
+    """Number of processes."""
 
     @property
     def first(self) -> bool:
@@ -52,7 +52,7 @@ class Ranks:
         if self.world == 1:
             return make()
         box = [make() if self.first else None]
-        with _others():
+        with self.talking():
             dist.broadcast_object_list(box, src=0, device=torch.device("cpu"))
         return cast(T, box[0])
 
@@ -60,18 +60,25 @@ class Ranks:
         """Return the sum of a number over all ranks."""
         if self.world > 1:
             value = value.clone()
-            with _others():
+            with self.talking():
                 dist.all_reduce(value)
         return value
 
     @contextmanager
     def talking(self) -> Iterator[None]:
         """Turn errors of what ranks do together into one that says that a rank is gone."""
-        if self.world == 1:
+        try:
             yield
-            return
-        with _others():
-            yield
+        except RuntimeError as error:
+            if self.world == 1:
+                raise
+            raise TrainError(
+                "another rank of this training has ended",
+                got=str(error).partition(". ")[0],
+                where=f"rank {dist.get_rank()}",
+                do="read what the other rank says; give the same command again to go on from the "
+                "last checkpoint",
+            ) from error
 
     def share(self, batch_size: int) -> slice:
         """Return the examples of a batch that this rank takes.
@@ -91,7 +98,7 @@ class Ranks:
 
 @contextmanager
 def open_ranks(device: str) -> Iterator[Ranks]:
-    """Open the processes that `torchrun` started, or this one alone; use the caller's group if any.
+    """Join the processes that `torchrun` started, or the caller's group; else stay alone.
 
     Gradients go over NCCL from GPUs, over Gloo from elsewhere.
 
@@ -133,18 +140,3 @@ def rank_here() -> int:
 def device_here(device: str) -> str:
     """Return the device of this process: ``cuda`` stands for one GPU for each."""
     return f"cuda:{os.environ['LOCAL_RANK']}" if launched() and device == "cuda" else device
-
-
-@contextmanager
-def _others() -> Iterator[None]:
-    """Turn errors while ranks talk into one that says that a rank is gone."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise TrainError(
-            "another rank of this training has ended",
-            got=str(error).partition(". ")[0],
-            where=f"rank {dist.get_rank()}",
-            do="read what the other rank says; give the same command again to go on from the "
-            "last checkpoint",
-        ) from error

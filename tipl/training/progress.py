@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -11,19 +10,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from weighttraj.progress import LoggedProgress
 
 
-class TrainingBar:
-    """Shows batches done, batches a second and the error; draws nothing on a quiet console.
-
-    Args:
-        total: batches of the whole training.
-        start: batches done before.
-        console: where to draw.
-        measure: what the error is called.
-    """
+class TrainingBar(LoggedProgress):
+    """Shows batches done, batches a second and the error; draws nothing on a quiet console."""
 
     def __init__(self, total: int, start: int, console: Console, measure: str) -> None:
-        # Twice a second: drawing takes time from the training.
-        self._progress = LoggedProgress(
+        super().__init__(
             TextColumn("training"),
             BarColumn(),
             MofNCompleteColumn(),
@@ -32,40 +23,24 @@ class TrainingBar:
             ),
             TimeRemainingColumn(),
             console=console,
-            refresh_per_second=2,
+            refresh_per_second=2,  # drawing takes time from the training
             disable=console.quiet,
         )
-        self._task = self._progress.add_task(
+        self._bar = self.add_task(
             "training", total=total, completed=start, speed=0.0, error=float("nan")
         )
-        self._since, self._count = time.perf_counter(), 0
+        self.measure_again()
 
-    def advance(self, error: float) -> None:
-        """Count one more batch.
-
-        Args:
-            error: mean error since the last line of the log.
-        """
+    def count(self, error: float) -> None:
+        """Count one more batch; the error is the mean since the last line of the log."""
         self._count += 1
-        self._progress.update(self._task, advance=1, speed=self.speed, error=error)
+        self.update(self._bar, advance=1, speed=self.speed, error=error)
 
     @property
     def speed(self) -> float:
         """Batches a second since the last line of the log."""
         return self._count / max(time.perf_counter() - self._since, 1e-9)
 
-    def restart(self) -> None:
-        """Begin to measure again: a line of the log was written."""
+    def measure_again(self) -> None:
+        """Measure the speed from now on: a line of the log was written."""
         self._since, self._count = time.perf_counter(), 0
-
-    def __enter__(self) -> TrainingBar:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._progress.stop()

@@ -25,7 +25,7 @@ from tipl.horizons import fitted, too_short
 from tipl.runs import checksum_of, fault_of, warn_left_out, weights_of
 from tipl.saved import SavedNetwork
 from tipl.settings import check_settings
-from tipl.training.config import LoopConfig, flat
+from tipl.training.config import LoopConfig, defaults_of, flat
 from tipl.training.loop import Examples, Learner, train_network
 from weighttraj.progress import LoggedProgress
 
@@ -166,8 +166,7 @@ def train_on_starts(
         lambda *_: learner(config),
         config.training,
         config.out,
-        learner.settings,
-        defaults=flat(config),
+        defaults=defaults_of(config),
         console=console,
     )
 

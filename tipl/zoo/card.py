@@ -1,8 +1,8 @@
 """The card of a released model: prose by hand, and what ``metrics.json`` says between markers.
 
-A card is made once from a template of the model's kind. From then on its prose is its author's, and
-``tipl card`` rewrites only the places that begin with ``<!-- facts of NAME, SECTION: ... -->``. A
-section brings its heading, so that what was not measured leaves no empty one.
+A card is made once from a template of the model's kind. After that ``tipl card`` only rewrites the
+places that begin with ``<!-- facts of NAME, SECTION: ... -->``, from the template ``facts.md``. A
+section has its own heading, so that what was not measured leaves no empty one.
 
 | section | what it says |
 |---|---|
@@ -15,7 +15,6 @@ section brings its heading, so that what was not measured leaves no empty one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ import msgspec
 from matplotlib.figure import Figure
 
 from tipl import registry
+from tipl.checks.results import CheckResults
 from tipl.errors import ModelError
 from tipl.report.figures import svg
 from tipl.report.markdown import rewrite, table_lines
@@ -42,15 +42,11 @@ _TESTS = {
 }
 
 
+SECTIONS = ("summary", "baselines", "checks", "training", "commands")
+
+
 def write_card(name: str, out: Path) -> Path:
-    """Write a model's card, or what comes from its figures into the card that is there.
-
-    Args:
-        name: in the zoo.
-        out: folder of the cards.
-
-    Returns:
-        The card.
+    """Write a model's card into a folder, or rewrite the places of the card that is there.
 
     Raises:
         ModelError: there is no such model, or it was not evaluated.
@@ -66,7 +62,7 @@ def write_card(name: str, out: Path) -> Path:
 
 
 def metrics_of(name: str) -> Metrics:
-    """What is known of a released model.
+    """Return what is known of a released model.
 
     Raises:
         ModelError: there is no such model, or it was not evaluated.
@@ -83,13 +79,19 @@ def metrics_of(name: str) -> Metrics:
 
 
 def new_card(metrics: Metrics) -> str:
-    """A card from the template of its kind, or from the one for all; its places are empty."""
-    loader = jinja2.PackageLoader("tipl", "templates")
-    environment = jinja2.Environment(  # noqa: S701  Markdown, from our own templates
-        loader=loader, trim_blocks=True, keep_trailing_newline=True
-    )
+    """Return a card from the template of its kind, or the one for all; its places are empty."""
     wanted = [f"card-{metrics.kind}.md", "card.md"]
-    return environment.select_template(wanted).render(metrics=metrics)
+    return _templates().select_template(wanted).render(metrics=metrics)
+
+
+def _templates() -> jinja2.Environment:
+    loader = jinja2.PackageLoader("tipl", "templates")
+    return jinja2.Environment(  # noqa: S701  Markdown, from our own templates
+        loader=loader,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
 
 
 def refreshed(card: str, metrics: Metrics) -> str:
@@ -98,20 +100,37 @@ def refreshed(card: str, metrics: Metrics) -> str:
 
 
 def facts(metrics: Metrics, section: str) -> str:
-    """One section as Markdown, empty if there is nothing to say.
+    """Return one section as Markdown, empty if there is nothing to say.
 
     Raises:
         ModelError: there is no such section.
     """
-    if section not in _SECTIONS:
+    if section not in SECTIONS:
         raise ModelError(
             "there is no such section of a card",
-            expected=", ".join(_SECTIONS),
+            expected=", ".join(SECTIONS),
             got=section,
             where=metrics.name,
             do="change the marker in the card",
         )
-    return _SECTIONS[section](metrics)
+    if section == "commands":
+        return _commands(metrics)
+    results = metrics.results
+    own = {name: results.forecasters[name] for name in (PERSISTENCE, metrics.evaluated_as)}
+    context = {
+        "metrics": metrics,
+        "results": results,
+        "alone": msgspec.structs.replace(results, forecasters=own),
+        "is_model": registry.is_model(metrics.kind),
+        "all_settings": _settings(metrics),
+        "tests": _TESTS,
+        "headline": headline,
+        "measured": _measured,
+        "table_lines": table_lines,
+        "verdict": verdict,
+    }
+    sections: Any = _templates().get_template("facts.md").make_module(context)
+    return str(getattr(sections, section)()).strip("\n")
 
 
 def training_figure(metrics: Metrics) -> Figure:
@@ -145,71 +164,11 @@ def training_figure(metrics: Metrics) -> Figure:
     return fig
 
 
-def _summary(metrics: Metrics) -> str:
-    results = metrics.results
-    causal = "yes" if metrics.causal else "**no**: it has seen the future of the run"
-    lines = [f"- kind: `{metrics.kind}`; causal: {causal}"]
-    for trained in metrics.trained_on:
-        made = " by ".join(x for x in (trained.environment, trained.algorithm) if x)
-        lines += [
-            f"- trained on: `{trained.data}`, version {trained.version}, "
-            f"{len(trained.runs)} runs: {', '.join(trained.runs)}",
-            f"- policies: {trained.parameters:,} parameters{f', {made}' if made else ''}",
-        ]
-        if trained.every is not None:
-            lines.append(f"- cadence: a snapshot every {trained.every} gradient steps")
-    return "\n".join(
-        [
-            *lines,
-            f"- evaluated on: `{results.data}`, version {results.version}, "
-            f"{len(results.runs)} {results.split} runs: {', '.join(results.runs)}",
-        ]
-    )
-
-
-def _baselines(metrics: Metrics) -> str:
-    table, results = headline(metrics.results), metrics.results
-    own = {name: results.forecasters[name] for name in (PERSISTENCE, metrics.evaluated_as)}
-    alone = msgspec.structs.replace(results, forecasters=own)
-    told = verdict(alone) if registry.is_model(metrics.kind) else ""
-    note = (
-        "95 % intervals: bootstrap over runs; what another training would give is not in them. "
-        "Skill: 0 is persistence, 1 the truth. Of the baselines the best ones are shown."
-    )
-    if results.modes:
-        note += (
-            " Gain: of the return that training earns in h snapshots, with the exploration noise "
-            "of the start."
-        )
-    text = "\n".join(["## How well", "", *table_lines(table), "", note])
-    return f"{text}\n\n{told}" if told else text
-
-
-def _checks(metrics: Metrics) -> str:
-    checks = metrics.checks
-    if checks is None:
-        return ""
-    null = ", ".join(f"{skill:.2g} at h = {h}" for h, skill in checks.null.items())
-    lines = ["## Five checks", "", "| check | measured | passes |", "|---|---|---|"]
-    for name, meaning in _TESTS.items():
-        shown = f"skill {null}" if name == "null" else _measured(name, getattr(checks, name))
-        lines.append(f"| {meaning} | {shown} | {'yes' if checks.passed[name] else 'no'} |")
-    limits = checks.largest
-    batches = "" if metrics.kind == "regression" else f", for {checks.batches:,} batches"
-    again = (
-        f"For the random walks one like it was fitted to {checks.walks - 2} others{batches}. "
-        if checks.fitted_to_walks
-        else ""
-    )
-    lines += [
-        "",
-        f"{again}A skill passes below {limits.null} either way, an error, relative to the "
-        f"displacement, below {limits.error}. On run `{checks.run}`: `{checks.command}`",
-    ]
-    return "\n".join(lines)
-
-
-def _measured(name: str, value: object) -> str:
+def _measured(checks: CheckResults, name: str) -> str:
+    """Return what a check found, as text."""
+    value = getattr(checks, name)
+    if name == "null":
+        return "skill " + ", ".join(f"{skill:.2g} at h = {h}" for h, skill in value.items())
     if value is None:
         return "its basis needs more directions" if name == "drift" else "no such units"
     if isinstance(value, bool):
@@ -217,65 +176,11 @@ def _measured(name: str, value: object) -> str:
     return f"error {value:.2g}"
 
 
-def _training(metrics: Metrics) -> str:
-    if not metrics.settings and not metrics.log:
-        return ""
-    lines = ["## Training"]
-    for what, settings in _settings(metrics).items():
-        if settings:
-            told = ", ".join(f"{k} {v}" for k, v in settings.items())
-            lines += ["", f"Settings{what}: {told}"]
-    if metrics.kind == "drift":
-        lines += ["", *_amplitudes(metrics)]
-    elif metrics.log:
-        lines += ["", _errors(metrics), "", f"![error against batches]({metrics.name}.svg)"]
-    return "\n".join(lines)
-
-
 def _settings(metrics: Metrics) -> dict[str, dict[str, Any]]:
-    """Of the training, and of that of the network before it."""
+    """Return the settings of the training, and of that of the network before it."""
     own = {k: value for k, value in metrics.settings.items() if value not in ([], None)}
     before = own.pop("of_gate", {})
     return {" of the network": before, " of the amplitudes": own} if before else {"": own}
-
-
-def _amplitudes(metrics: Metrics) -> list[str]:
-    """Gains on validation runs, of each amplitude at each horizon; the highest are bold."""
-    horizons = [key.removeprefix("gain_") for key in metrics.log[0] if key.startswith("gain_")]
-    best = {h: max(line[f"gain_{h}"] for line in metrics.log) for h in horizons}
-    lines = [
-        "Inference gain on validation runs, with the exploration noise of the start:",
-        "",
-        "| amplitude | " + " | ".join(f"h = {h}" for h in horizons) + " |",
-        "|---:|" + "---:|" * len(horizons),
-    ]
-    for line in metrics.log:
-        cells = (
-            f"**{gain:.2f}**" if (gain := line[f"gain_{h}"]) == best[h] else f"{gain:.2f}"
-            for h in horizons
-        )
-        lines.append(f"| {line['amplitude']:g} | {' | '.join(cells)} |")
-    return lines
-
-
-def _errors(metrics: Metrics) -> str:
-    """Where the training ended."""
-    last = metrics.log[-1]
-    key = "wpe" if "wpe" in last else "error"
-    found = [f"{last[key]:.3g} on training runs"]
-    if (held_out := f"validation_{key}") in last:
-        found.append(f"{last[held_out]:.3g} on validation runs")
-    after = f"After {last['batch']:,.0f} batches, "
-    if key == "error":
-        return after + (
-            "the squared error over that of persistence, a mean over starts and horizons, is "
-            f"{' and '.join(found)}. The state that is best on validation runs is kept."
-        )
-    first = metrics.results.forecasters[PERSISTENCE].wpe[0]
-    return after + (
-        f"WPE is {' and '.join(found)}; that of persistence, h = {first.h}, on the evaluated "
-        f"runs, is {first.value or 0:.3g}."
-    )
 
 
 def _commands(metrics: Metrics) -> str:
@@ -300,12 +205,3 @@ def _option(setting: tuple[str, Any]) -> str:
         return f"--{'' if value else 'no-'}{key.replace('_', '-')}"
     values = value if isinstance(value, list) else [value]
     return f"--{key.replace('_', '-')} {' '.join(map(str, values))}"
-
-
-_SECTIONS: dict[str, Callable[[Metrics], str]] = {
-    "summary": _summary,
-    "baselines": _baselines,
-    "checks": _checks,
-    "training": _training,
-    "commands": _commands,
-}

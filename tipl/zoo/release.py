@@ -1,15 +1,15 @@
 """Puts a trained forecaster into the zoo, with what is known of it.
 
 What is released must be what was evaluated, byte for byte, and a model above 3 MB is rounded when
-it is released. So it goes in two steps, with the evaluation between them::
+it is released. So there are two steps, with the evaluation between them::
 
     tipl release FOLDER --name NAME
     tipl evaluate NAME ... --data DATA --out OUT
     tipl release FOLDER --name NAME --results OUT/results.json
 
-The first one puts the model into the zoo, rounded if it must be, as a draft without figures. It is
-evaluated there, by its name. The second one adds the figures, if the results are those of the bytes
-in the zoo (``fingerprint``); a model that needs no rounding can be evaluated before.
+The first step puts the model into the zoo, rounded if necessary, as a draft without figures, where
+it is evaluated by its name. The second one adds the figures if the results are those of the bytes
+in the zoo (``fingerprint``). A model that needs no rounding can be evaluated before.
 """
 
 from __future__ import annotations
@@ -32,16 +32,14 @@ from tipl.checks.results import CheckResults, read_checks
 from tipl.errors import ModelError
 from tipl.evaluation.results import Results, Scores, read_results, write_document
 from tipl.report.scores import REPW, SKILL, function_skill, oracles, shown
-from tipl.saved import fingerprint
+from tipl.saved import ARRAYS, CONFIG, fingerprint
 from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics
 
 MOST = 3_000_000
-"""Bytes of a model's arrays. Larger ones are rounded to float16, and refused if still larger."""
+"""Largest size of a model's arrays in bytes, after rounding to float16 if necessary."""
 LINES = 100
-"""Of a training's log that are kept."""
-_ARRAYS = "model.safetensors"
+"""Number of lines of a training's log that are kept."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]*")
-_OF_THE_SPEED = ("batches_per_s",)
 _OF_THE_MACHINE = (
     "data",
     "out",
@@ -65,23 +63,20 @@ def release(
     checks: Path | None = None,
     log: bool = True,
 ) -> Path:
-    """Copy a forecaster into the zoo; with results, also what is known of it.
+    """Copy a forecaster into the zoo, with what is known of it; return its folder there.
 
-    Nothing in the zoo changes before all of it was found good. What was known of the same bytes
-    and is not given again stays: a model that lies in the zoo can be evaluated again.
+    Nothing in the zoo changes before everything is checked. What was known of the same bytes and is
+    not given again stays.
 
     Args:
-        folder: of the trained model; its train.json and log.jsonl are read, if they are there.
-        name: in the zoo.
+        folder: folder of the trained model; its train.json and log.jsonl are read if they exist.
+        name: name in the zoo.
         results: a results.json in which the model of the zoo was evaluated; None: a draft.
         checks: what ``tipl check`` wrote of it.
         log: keep some lines of the training's log.
 
-    Returns:
-        The model's folder in the zoo.
-
     Raises:
-        ModelError: the folder holds no forecaster or too large a one, the name will not do, or
+        ModelError: the folder holds no forecaster or too large a one, the name is invalid, or
             results or checks are of other bytes.
     """
     _check_name(name)
@@ -126,7 +121,7 @@ def _metrics(
 
 
 def _training(folder: Path, known: Metrics | None, log: bool) -> dict[str, Any]:
-    """What the folder says of the training, or else what was known of it."""
+    """Return what the folder says of the training, or else what was known of it."""
     settings = _json(folder / "train.json")
     if not settings and known is not None:
         return {
@@ -163,13 +158,13 @@ def reduced(results: Results, evaluated_as: str) -> Results:
 
 
 def thinned(log: Path) -> list[dict[str, float]]:
-    """At most ``LINES`` lines of a log, evenly spaced on a logarithmic scale of batches."""
+    """Return at most ``LINES`` lines of a log, evenly spaced on a logarithmic scale of batches."""
     if not log.exists():
         return []
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     last = len(lines) - 1
     chosen = np.unique(np.geomspace(1, last + 1, min(LINES, last + 1)).round().astype(int)) - 1
-    return [{k: v for k, v in lines[i].items() if k not in _OF_THE_SPEED} for i in chosen]
+    return [{k: v for k, v in lines[i].items() if k != "batches_per_s"} for i in chosen]
 
 
 def _check_name(name: str) -> None:
@@ -185,13 +180,18 @@ def _check_name(name: str) -> None:
 def _copy(folder: Path, out: Path) -> None:
     """Write config.json, and the arrays, rounded if they are too large.
 
-    Only matrices are rounded: vectors weigh nothing, and scales among them need their digits.
+    Only matrices are rounded: vectors are small, and scales among them need their digits.
     """
-    arrays = load_file(folder / _ARRAYS) if (folder / _ARRAYS).exists() else None
+    arrays = load_file(folder / ARRAYS) if (folder / ARRAYS).exists() else None
     packed = None if arrays is None else save(arrays)
     if arrays is not None and packed is not None and len(packed) > MOST:
         with np.errstate(over="ignore"):
-            arrays = {k: v.astype(np.float16) if _rounds(v) else v for k, v in arrays.items()}
+            arrays = {
+                name: array.astype(np.float16)
+                if array.ndim > 1 and array.dtype == np.float32
+                else array
+                for name, array in arrays.items()
+            }
         packed = save(arrays)
         if len(packed) > MOST or not all(np.isfinite(v).all() for v in arrays.values()):
             raise ModelError(
@@ -203,18 +203,14 @@ def _copy(folder: Path, out: Path) -> None:
             )
     out.mkdir(parents=True, exist_ok=True)
     if packed is not None:
-        (out / _ARRAYS).write_bytes(packed)
-    (out / "config.json").write_bytes((folder / "config.json").read_bytes())
-    for inner in folder.glob("*/config.json"):  # a forecast along another one
+        (out / ARRAYS).write_bytes(packed)
+    shutil.copyfile(folder / CONFIG, out / CONFIG)
+    for inner in folder.glob(f"*/{CONFIG}"):  # a forecast along another one
         _copy(inner.parent, out / inner.parent.name)
 
 
-def _rounds(array: np.ndarray) -> bool:
-    return array.ndim > 1 and array.dtype == np.float32
-
-
 def _find(results: Results, mark: str, name: str, where: Path) -> str:
-    """What the model of these bytes is called in the results."""
+    """Return the name of the model of these bytes in the results."""
     marks = {n: s.fingerprint for n, s in results.forecasters.items()}
     if results.split == "train" or mark not in marks.values():
         raise ModelError(
@@ -243,7 +239,7 @@ def _checks(file: Path, mark: str, name: str) -> CheckResults:
 
 
 def _trained_on(settings: dict[str, Any]) -> tuple[TrainedOn, ...]:
-    """The runs that a training's settings name: of one data set, or of several in order."""
+    """Return the runs that a training's settings name, of one data set or several."""
     data, runs = settings.get("data"), settings.get("runs")
     if data is None or runs is None:
         return ()

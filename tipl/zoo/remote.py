@@ -1,7 +1,7 @@
 """Publishes models at an address, on the Hugging Face hub or in an object store.
 
-One address holds one model: what its folder does, ``config.json`` and ``safetensors``, and a card.
-Nothing in it is code, and nothing is unpickled.
+One address holds one model: ``config.json``, ``safetensors`` and a card. Nothing there is code, and
+nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ def push(
     """Publish a model, whole or not at all.
 
     Args:
-        model: a forecaster, the folder of a saved one, or a released one by its name, which brings
-            its card.
-        address: ``hf://org/name``, or a place of its own in an object store: ``s3://bucket/name``.
-        private: of a new repository on the hub: only its organisation sees it.
-        card: its card, Markdown; None: that of a released model, else the one in the folder.
+        model: a forecaster, the folder of a saved one, or the name of a released one.
+        address: ``hf://org/name``, or an empty place in an object store: ``s3://bucket/name``.
+        private: whether only the organisation sees a new repository on the hub.
+        card: a Markdown file; None: the card of a released model, else README.md in the folder.
 
     Returns:
         The address; on the hub with the commit that it is now.
@@ -70,12 +69,12 @@ def _push_to_hub(folder: Path, place: RemotePath, private: bool) -> str:
 
 
 def _write(model: Forecaster | str | Path, out: Path, card: Path | None) -> None:
-    """The files of a model and its card, as they are published."""
+    """Write the files of a model and its card, as they are published."""
     folder = registry.folder_of(model) if isinstance(model, str | Path) else None
     released = folder is not None and folder.parent == registry.MODELS
     if folder is not None and released:
         shutil.copytree(folder, out)
-    else:  # of a training only the model: its state, log and settings are of this machine
+    else:  # only the model: state, log and settings of a training stay on this machine
         forecaster = registry.load(model) if isinstance(model, str | Path) else model
         forecaster.save(out)
     if card is None and folder is not None and released:

@@ -71,7 +71,11 @@ class AdamReader:
 
 
 class _ReadAhead:
-    """Reads rows that lie close together from one block: moments are in no memory map."""
+    """Reads rows of the run in blocks.
+
+    The memory map of ``weighttraj.load`` has weights only. A copy of the moments would take twice
+    their space in the cache, few runs store them, and a walk reads each row once, in order.
+    """
 
     def __init__(self, array: Any, last: int) -> None:
         self._array, self._last = array, last

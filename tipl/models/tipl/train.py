@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Float, Int
 from rich.console import Console
@@ -18,7 +19,7 @@ from tipl.models.tipl.forecaster import TIPL, TIPLConfig
 from tipl.models.tipl.network import GPT, GPTConfig
 from tipl.settings import check_heads, check_settings
 from tipl.training import Learner, LoopConfig, train_network
-from tipl.training.config import flat
+from tipl.training.config import defaults_of, flat
 from tipl.training.parallel import Ranks
 
 VALIDATION_SHARE = 0.01
@@ -93,11 +94,10 @@ def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
     """
     config.check()
     train_network(
-        lambda ranks, _: TIPLLearner(config, ranks),
+        lambda ranks: TIPLLearner(config, ranks),
         config.training,
         config.out,
-        lambda learner: flat(config) | {"runs": learner.prepared.checksums},
-        defaults=flat(config),
+        defaults=defaults_of(config),
         console=console,
     )
     return TIPL.load(config.out)
@@ -128,6 +128,10 @@ class TIPLLearner(Learner[Windows]):
         mean, std = self._sampler.moments()
         self.network.input_mean.copy_(mean)
         self.network.input_std.copy_(std + 1e-6)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what train.json says of the training."""
+        return flat(self._config) | {"runs": self.prepared.checksums}
 
     def batch(self, n: int) -> Windows:
         """Return random windows of the training runs."""
