@@ -17,8 +17,7 @@ from weighttraj import Run
 class Forecaster(Protocol):
     """Forecasts the weights of a policy some snapshots ahead.
 
-    A class that names this one as its base only has to write ``name`` and ``forecast``; the other
-    members have defaults.
+    A subclass only needs ``name`` and ``forecast``; the other members have defaults.
     """
 
     @property
@@ -28,7 +27,7 @@ class Forecaster(Protocol):
 
     @property
     def kind(self) -> str:
-        """Which kind of forecaster this is, as ``config.json`` of a saved one says."""
+        """Kind of the forecaster, which ``config.json`` of a saved one names."""
         return "other"
 
     @property
@@ -38,7 +37,7 @@ class Forecaster(Protocol):
 
     @property
     def is_oracle(self) -> bool:
-        """Whether it reads the true future, and so shows a bound and not a forecast."""
+        """Whether it reads the true future, and so is a bound and not a forecast."""
         return False
 
     def forecast(
@@ -47,19 +46,20 @@ class Forecaster(Protocol):
         """Return forecasts of phi_{t+h} for each start t and horizon h, from phi_0, ..., phi_t.
 
         Args:
-            run: whose weights they are.
+            run: the run.
             starts: rows of ``run.weights``, from 0, in any order.
-            horizons: snapshots ahead, from 1.
+            horizons: numbers of snapshots ahead, from 1.
 
         Raises:
-            ForecastError: it makes no such forecast, or of no such run.
+            ForecastError: it makes no such forecast.
+            ModelError: it makes no forecast of such a run.
         """
         ...
 
     def save(self, path: str | Path) -> None:
         """Write the forecaster into a folder; the default writes its class and name.
 
-        The files identify a forecaster: two with the same files are taken for the same one.
+        Two forecasters with the same files are taken for the same one.
         """
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
@@ -68,16 +68,17 @@ class Forecaster(Protocol):
 
     @classmethod
     def load(cls, path: str | Path) -> Forecaster:
-        """Read what ``save`` wrote; the default makes a new forecaster without arguments."""
+        """Read what ``save`` wrote; the default makes a new forecaster without arguments.
+
+        Raises:
+            FileNotFoundError: there is no forecaster in the folder.
+            ModelError: the files are those of another kind, or damaged.
+        """
         return cls()
 
 
 def check_forecaster(forecaster: object) -> None:
-    """Check that an object follows the protocol.
-
-    Raises:
-        ForecastError: a member is missing.
-    """
+    """Refuse an object that does not follow the protocol."""
     wanted = ("name", "kind", "causal", "is_oracle", "forecast", "save", "load")
     if missing := [member for member in wanted if not hasattr(forecaster, member)]:
         raise ForecastError(
@@ -89,11 +90,7 @@ def check_forecaster(forecaster: object) -> None:
 
 
 def check_request(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> None:
-    """Check what a forecaster is asked for.
-
-    Raises:
-        ForecastError: a start is no snapshot of the run, or a horizon is below 1.
-    """
+    """Refuse starts that are no snapshots of the run, and horizons below 1."""
     if not (
         len(starts)
         and len(horizons)
@@ -108,18 +105,23 @@ def check_request(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> N
         )
 
 
+def every_of(run: Run) -> int | None:
+    """Return the number of gradient steps from one snapshot to the next; None: not recorded."""
+    return run.info.cadence.every if run.info.cadence else None
+
+
 def check_cadence(run: Run, every: int | None, phases: int | None = None) -> None:
-    """Check that a run has the cadence that a model was trained on.
+    """Refuse a run whose cadence is not that of the training runs.
 
     Args:
         run: the run to forecast.
-        every: gradient steps from one snapshot to the next in the training runs.
-        phases: snapshots of one iteration in the training runs; None: they do not matter.
+        every: number of gradient steps from one snapshot to the next in the training runs.
+        phases: number of snapshots of an iteration in the training runs; None: it does not matter.
 
     Raises:
         ModelError: the run has another cadence.
     """
-    got = run.info.cadence.every if run.info.cadence else None
+    got = every_of(run)
     longest = 0 if phases is None else int(run.phase.max()) + 1
     if got != every or longest > (phases or 0):
         raise ModelError(

@@ -1,8 +1,7 @@
 """Every kind of forecaster: its class, how it is trained, how it is refitted, its command.
 
-All that lists kinds reads this registry: loading, `tipl train`, the checks, cards and reports. A
-kind from outside joins with ``register``, or by an entry point in the group ``tipl.kinds`` that
-names a ``Kind``::
+Loading, `tipl train`, the checks, cards and reports read this registry. A kind from outside joins
+with ``register``, or by an entry point in the group ``tipl.kinds`` that names a ``Kind``::
 
     [project.entry-points."tipl.kinds"]
     mine = "my_package:KIND"
@@ -50,12 +49,12 @@ class Kind:
     help: str = ""
     """What it is trained to do, in one line, for the help of ``tipl train``."""
     command: str | None = None
-    """What follows ``tipl train``; unset: it is trained in no way, or with another kind."""
+    """Word after ``tipl train``; unset: it is not trained, or together with another kind."""
     train: str | None = None
-    """``module:function`` of (config, console) that trains it. The type of ``config``, a dataclass,
-    gives the options of the command."""
+    """``module:function`` of (config, console) that trains it. The fields of ``config``, a
+    dataclass, are the options of the command."""
     refit: str | None = None
-    """``module:function`` of (forecaster, runs, RefitConfig) that fits one like it to other runs,
+    """``module:function`` of (forecaster, runs, RefitConfig) that fits a similar one to other runs,
     for the null check; unset: there is nothing to fit."""
     is_model: bool = False
     """Whether it is a model to be compared with baselines, and not a baseline."""
@@ -97,16 +96,15 @@ def unfitted() -> dict[str, Forecaster]:
 
 
 def load(name: str | Path, *, revision: str | None = None) -> Forecaster:
-    """Load a forecaster: by its folder, its name, its address, or its class.
+    """Load a forecaster by its folder, name, address or class.
 
-    Looked for in this order: a folder, a model of the zoo, a baseline that needs no fit, a class
-    ``module:Class``, which is called without arguments. A released model is part of the package:
-    nothing is downloaded. One at an address, ``hf://org/name`` or ``s3://bucket/name``, is
-    downloaded the first time.
+    The name is looked up in this order: a folder, a model of the zoo, which comes with the package,
+    a baseline that needs no fit, a class ``module:Class``, which is called without arguments. A
+    model at an address, ``hf://org/name`` or ``s3://bucket/name``, is downloaded the first time.
 
     Args:
         name: folder, name, address or class.
-        revision: branch, tag or commit, of a model on the hub.
+        revision: branch, tag or commit of a model on the hub.
 
     Raises:
         ForecastError: there is no such folder, and no forecaster of this name.
@@ -133,17 +131,13 @@ def load(name: str | Path, *, revision: str | None = None) -> Forecaster:
 
 
 def load_folder(folder: Path) -> Forecaster:
-    """Load the forecaster that was saved in a folder.
-
-    Raises:
-        ModelError: the folder holds none.
-    """
+    """Load the forecaster that was saved in a folder."""
     forecaster: Forecaster = imported(kinds()[kind_in(folder)].forecaster).load(folder)
     return forecaster
 
 
 def folder_of(name: str | Path) -> Path | None:
-    """Return where a forecaster lies: a folder, or else a model of the zoo; None: neither."""
+    """Return the folder of a forecaster, or of a model of the zoo; None: it is neither."""
     path = Path(name)
     if (path / "config.json").is_file():
         return path
@@ -179,7 +173,7 @@ def _load_remote(address: str, revision: str | None) -> Forecaster:
 
     folder, called = fetch(address, revision)
     found: Any = load_folder(folder)
-    # A model is named after its folder, which in a cache is a hash.
+    # A model is named after its folder; in a cache that is a hash.
     has_name = is_dataclass(found) and any(field.name == "name" for field in fields(found))
     return replace(found, name=called) if has_name else found  # type: ignore[no-any-return]
 

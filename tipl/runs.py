@@ -1,7 +1,7 @@
 """How models read runs: through the decoded memory map of ``weighttraj.load``.
 
-A run is decoded and checked once, into a file that all processes map; every later reading is a
-slice of that map.
+A run is decoded and checked once, into a file that all processes map; later readings are slices of
+that map.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Rows(Protocol):
 def weights_of(run: Run) -> Float32[np.ndarray, "time param"]:
     """Return the weights of a run: a read-only memory map, decoded when it is first needed.
 
-    A run that is still being collected grows, and each of its states would be another file in the
-    cache. So the snapshots that it has are read into memory instead.
+    The snapshots of a run that is still being collected are read into memory instead: each state
+    of a growing run would be another file in the cache.
 
     Raises:
         CacheError: the cache's folder cannot be used.
@@ -70,7 +70,7 @@ def checksum_of(run: Run) -> str:
 
 @contextmanager
 def cache_in(folder: Path) -> Iterator[None]:
-    """Decode runs into another cache for a while: those of a test, say, that soon are deleted."""
+    """Decode runs into another cache for a while: runs that are soon deleted, for example."""
     before = os.environ.get("WEIGHTTRAJ_CACHE")
     os.environ["WEIGHTTRAJ_CACHE"] = str(folder)
     try:
@@ -85,9 +85,9 @@ def cache_in(folder: Path) -> Iterator[None]:
 def stratified(
     tensor: Int[np.ndarray, " param"], limit: int, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, " some"], Float[np.ndarray, " some"]]:
-    """Draw about ``limit`` parameters, some of each tensor, and how many each stands for.
+    """Draw about ``limit`` parameters, some of each tensor; return how many each stands for, too.
 
-    Each tensor has a share by its size; small ones have at least half of an equal share.
+    The share of a tensor is that of its size, and at least half of an equal share.
     """
     size, tensors = len(tensor), int(tensor.max()) + 1
     chosen, counts = [], []
@@ -126,11 +126,7 @@ def fault_of(weights: Rows) -> str | None:
 def without_faults(
     runs: Sequence[Run], fault: Callable[[Run], str | None]
 ) -> tuple[list[Run], dict[str, str]]:
-    """Leave out the runs that have a fault, with a warning that names each.
-
-    Returns:
-        The other runs; and the faults, by the id of the run.
-    """
+    """Return the runs without a fault, and the faults of the others by id; warn of each."""
     found = [(run, fault(run)) for run in runs]
     faults = {run.id: why for run, why in found if why is not None}
     for run, why in faults.items():

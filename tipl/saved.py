@@ -1,7 +1,7 @@
 """A forecaster on disk: config.json, and its arrays as safetensors. Nothing is pickled.
 
-What lies there may be a stranger's. So sizes are compared with the header of the arrays before
-anything of those sizes is allocated, and numbers that are not finite are refused.
+The files may come from strangers. So sizes are compared with the header of the arrays before
+anything of these sizes is allocated, and numbers that are not finite are refused.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import msgspec
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 from safetensors.torch import load_file as load_tensors
 from safetensors.torch import save_file as save_tensors
-from torch import nn
+from torch import Tensor, nn
 
 from tipl.errors import ModelError
 from tipl.forecaster import Forecaster
@@ -59,16 +59,16 @@ class SavedNetwork(Forecaster, Generic[N, C]):
     network: N
     """The network."""
     config: C
-    """Its sizes, and the snapshots that it is for."""
+    """Its sizes, and the cadence of the runs that it is for."""
     name: str = ""
-    """Name in tables and figures: of the folder that it was loaded from."""
+    """Name in tables and figures: the name of its folder."""
     config_type: ClassVar[type]
     """The class of ``config``."""
 
     @classmethod
     @abstractmethod
     def build(cls, config: C) -> N:
-        """Return a network of these sizes; its parameters are those before training."""
+        """Return an untrained network of these sizes."""
 
     def document(self) -> dict[str, Any]:
         """Return what config.json says."""
@@ -81,12 +81,7 @@ class SavedNetwork(Forecaster, Generic[N, C]):
 
     @classmethod
     def load(cls: type[S], path: str | Path) -> S:
-        """Read a saved forecaster; every parameter must be there.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the files are those of another kind, or damaged.
-        """
+        """Read a saved forecaster; every parameter must be there."""
         config: Any = read_config(path, str(cls.kind), cls.config_type)
         network = load_network(lambda: cls.build(config), config, path)
         return cls(network, config, Path(path).resolve().name)
@@ -109,13 +104,7 @@ class SavedSettings(Forecaster):
 def write(
     path: str | Path, config: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Write a forecaster into a folder.
-
-    Args:
-        path: the folder; made if it is not there.
-        config: JSON, with the ``kind`` of the forecaster.
-        arrays: what was fitted; None: nothing.
-    """
+    """Write a forecaster into a folder: its config, with its ``kind``, and its arrays, if any."""
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if arrays is not None:
@@ -123,40 +112,22 @@ def write(
     (path / CONFIG).write_text(json.dumps(config, indent=1), encoding="utf-8")
 
 
-def read_settings(path: str | Path, kind: str) -> dict[str, Any]:
-    """Return what ``write`` wrote into config.json, without the kind.
+def read_config(path: str | Path, kind: str, wanted: type[T]) -> T:
+    """Return what ``write`` wrote into config.json, without the kind, as a dataclass.
 
     Raises:
         FileNotFoundError: there is no forecaster in the folder.
-        ModelError: it is of another kind.
+        ModelError: it is of another kind, or its settings are not those of its kind.
     """
     file = Path(path) / CONFIG
     if file.stat().st_size > MOST_CONFIG:
         raise broken(path, f"{CONFIG} of {file.stat().st_size:,} bytes")
     try:
         settings = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+        if (got := settings.pop("kind", None)) != kind:
+            raise broken(path, f"a forecaster of kind {got!r}, not {kind!r}")
+        return msgspec.convert(settings, wanted)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise broken(path, error) from error
-    if (got := settings.pop("kind", None)) != kind:
-        raise broken(path, f"a forecaster of kind {got!r}, not {kind!r}")
-    return settings
-
-
-def read_config(path: str | Path, kind: str, wanted: type[T]) -> T:
-    """Return what ``write`` wrote into config.json, as a dataclass.
-
-    Args:
-        path: the folder.
-        kind: the kind of the forecaster that is asked for.
-        wanted: the dataclass; its fields are those of the config, ``kind`` left out.
-
-    Raises:
-        FileNotFoundError: there is no forecaster in the folder.
-        ModelError: it is of another kind, or its settings are not those of its kind.
-    """
-    try:
-        return msgspec.convert(read_settings(path, kind), wanted)
-    except msgspec.ValidationError as error:
         raise broken(path, error) from error
 
 
@@ -169,21 +140,15 @@ def read_arrays(path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> dict
     """
     if (got := header_of(path)) != dict(shapes):
         raise broken(path, f"arrays {got}, not {dict(shapes)}")
-    try:
-        arrays = load_file(Path(path) / ARRAYS)
-    except SafetensorError as error:
-        raise broken(path, error) from error
-    if not all(np.isfinite(array).all() for array in arrays.values()):
-        raise broken(path, "numbers that are not finite")
-    return arrays
+    return {name: tensor.numpy() for name, tensor in _tensors(path).items()}
 
 
 def load_network(build: Callable[[], N], config: Any, path: str | Path) -> N:
-    """Return a network with the parameters that lie in a folder: these, and no others.
+    """Return a network with the parameters in a folder: these and no others.
 
     Args:
-        build: makes a network of the sizes that the config says.
-        config: the config that it was read from; a dataclass.
+        build: makes a network of the sizes in the config.
+        config: what config.json says; a dataclass.
         path: the folder.
 
     Raises:
@@ -199,26 +164,30 @@ def load_network(build: Callable[[], N], config: Any, path: str | Path) -> N:
         raise broken(path, error) from error
     if shapes != header:
         raise broken(path, _difference(shapes, header))
+    tensors = _tensors(path)
     try:
-        tensors = load_tensors(Path(path) / ARRAYS)
-        if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-            raise broken(path, "parameters that are not finite")
-        with torch.random.fork_rng(devices=[]):  # loading moves nobody's random numbers
+        with torch.random.fork_rng(devices=[]):  # leaves the caller's random numbers alone
             network = build()
         network.load_state_dict(tensors, strict=True)
         network.eval()
-    except (SafetensorError, RuntimeError) as error:
+    except RuntimeError as error:
         raise broken(path, error) from error
     return network
 
 
-def header_of(path: str | Path) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arrays in a folder; no array is read.
+def _tensors(path: str | Path) -> dict[str, Tensor]:
+    """Return the arrays in a folder, all of them finite."""
+    try:
+        tensors = load_tensors(Path(path) / ARRAYS)
+    except SafetensorError as error:
+        raise broken(path, error) from error
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise broken(path, "numbers that are not finite")
+    return tensors
 
-    Raises:
-        FileNotFoundError: there are none.
-        ModelError: the file is damaged.
-    """
+
+def header_of(path: str | Path) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays in a folder; no array is read."""
     file = Path(path) / ARRAYS
     try:
         with safe_open(file, "np") as arrays:

@@ -1,8 +1,4 @@
-"""What an evaluation finds: one schema for all that writes, reads, reports and releases results.
-
-The file holds its version. ``python -m tipl.evaluation.convert FILE ...`` converts files from
-before there was one.
-"""
+"""What an evaluation finds: one schema for all that writes, reads, reports and releases results."""
 
 from __future__ import annotations
 
@@ -138,7 +134,7 @@ def read_results(file: Path) -> Results:
     """Read a result file of ``tipl evaluate``.
 
     Raises:
-        EvaluateError: it is none, or of another version.
+        EvaluateError: it is none, or its schema has another version.
         FileNotFoundError: it is not there.
     """
     try:
@@ -149,8 +145,7 @@ def read_results(file: Path) -> Results:
             expected="results.json, as `tipl evaluate` writes it",
             got=error,
             where=file,
-            do="evaluate again; a file of an older version is converted by "
-            "`python -m tipl.evaluation.convert FILE`",
+            do="evaluate again",
         ) from error
 
 

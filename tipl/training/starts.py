@@ -21,6 +21,7 @@ from torch import Tensor
 
 import weighttraj as wt
 from tipl.errors import RepresentationError, TrainError
+from tipl.forecaster import every_of
 from tipl.horizons import fitted, too_short
 from tipl.runs import checksum_of, fault_of, warn_left_out, weights_of
 from tipl.saved import SavedNetwork
@@ -59,10 +60,10 @@ class StartsConfig:
     """Folder of the model. A training that stopped goes on from its last checkpoint."""
     starts: int = 600
     """Number of starts of each run that are trained on, about."""
-    network: Any
-    """Sizes of the network, ``horizons`` and ``phases`` among them."""
     training: LoopConfig
     """How the network is trained."""
+    network: Any
+    """Sizes of the network, ``horizons`` and ``phases`` among them."""
 
     def check(self) -> None:
         """Refuse numbers that make no training.
@@ -239,7 +240,7 @@ def cadence_of(runs: Sequence[wt.Run]) -> tuple[int | None, int]:
     Raises:
         TrainError: the runs differ.
     """
-    cadences = {run.info.cadence.every if run.info.cadence else None for run in runs}
+    cadences = {every_of(run) for run in runs}
     if len(cadences) != 1:
         raise TrainError(
             "the runs have different cadences",

@@ -31,6 +31,7 @@ from tipl import registry
 from tipl.checks.results import CheckResults, read_checks
 from tipl.errors import ModelError
 from tipl.evaluation.results import Results, Scores, read_results, write_document
+from tipl.forecaster import every_of
 from tipl.report.scores import REPW, SKILL, function_skill, oracles, shown
 from tipl.saved import ARRAYS, CONFIG, fingerprint
 from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics
@@ -250,14 +251,15 @@ def _trained_on(settings: dict[str, Any]) -> tuple[TrainedOn, ...]:
 
 def _of_one(data: str, runs: dict[str, str]) -> TrainedOn:
     dataset = wt.open_dataset(data)
-    info = dataset[next(iter(runs))].info
+    run = dataset[next(iter(runs))]
+    info = run.info
     return TrainedOn(
         data=dataset.info.id,
         version=dataset.info.version,
         runs=tuple(runs),
         environment=info.env.id if info.env else None,
         algorithm=info.algorithm.name if info.algorithm else None,
-        every=info.cadence.every if info.cadence else None,
+        every=every_of(run),
         parameters=info.layout.size,
     )
 

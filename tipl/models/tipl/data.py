@@ -13,6 +13,7 @@ from torch import Tensor
 
 import weighttraj as wt
 from tipl.errors import RepresentationError, TrainError
+from tipl.forecaster import every_of
 from tipl.representation import Embedded, embed
 from tipl.runs import checksum_of
 from tipl.training import Examples
@@ -198,15 +199,11 @@ def prepare(data: str | Path, *, rank: int, window: int) -> Prepared:
         train=[_tokens(run, rank) for run in train],
         # The model has no time embedding for what comes after the longest training run.
         validation=[_cut(_tokens(run, rank), longest) for run in held_out],
-        every=_every(train[0]),
+        every=every_of(train[0]),
         parameters=train[0].layout.size,
         longest=longest,
         checksums={run.id: checksum_of(run) for run in train},
     )
-
-
-def _every(run: wt.Run) -> int | None:
-    return run.info.cadence.every if run.info.cadence else None
 
 
 def _cut(run: TokenRun, longest: int) -> TokenRun:
@@ -219,14 +216,14 @@ def _check_alike(runs: Sequence[wt.Run], data: str | Path) -> None:
     for run in runs:
         for what, same in (
             ("layouts", run.layout == first.layout),
-            ("cadences", _every(run) == _every(first)),
+            ("cadences", every_of(run) == every_of(first)),
         ):
             if not same:
                 raise TrainError(
                     f"the runs have different {what}",
                     expected=f"as run {first.id}: {first.layout.size} parameters, "
-                    f"a snapshot every {_every(first)} gradient steps",
-                    got=f"run {run.id}: {run.layout.size} parameters, every {_every(run)}",
+                    f"a snapshot every {every_of(first)} gradient steps",
+                    got=f"run {run.id}: {run.layout.size} parameters, every {every_of(run)}",
                     where=data,
                     do="train on one data set of one policy and one cadence",
                 )
