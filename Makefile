@@ -5,8 +5,10 @@ DEMO := data/demo
 RELEASED := inverted-pendulum-v4-ppo-v1
 # Baselines that are followed further, as tipl-drift follows the gate.
 RIVALS := last-step trend-20 ema-0.9 data/results/ladder/ar-20-phase
+# The processes that tests start share compiled code: without it each compiles both packages again.
+PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
-.PHONY: demo test lint docs bench results stress setup clean-demo
+.PHONY: demo test test-long lint docs bench results stress setup clean-demo
 
 setup: .venv/installed
 
@@ -25,7 +27,10 @@ demo: setup ## open the released data, collect a run beside it, train TIPL, judg
 	$(BIN)/tipl evaluate $(DEMO)/tipl --data inverted-pendulum-v4-ppo-v1 --out $(DEMO)/report --quick --workers 2
 
 test: setup ## run the tests
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
+	$(PYTEST)
+
+test-long: setup ## run the tests and their long versions, with the types of every call checked
+	WEIGHTTRAJ_CHECK_ALL_TYPES=1 $(PYTEST) -m "long or not long" --timeout 900
 
 lint: setup ## check style and types
 	$(BIN)/ruff format --check .

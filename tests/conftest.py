@@ -1,4 +1,7 @@
-"""Real short trainings, shared by the tests of a process; shapes and types are checked."""
+"""Real short trainings, shared by the tests; shapes and types are checked.
+
+Importing this file stays cheap: pytest imports it in the process that only hands out the tests.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +14,18 @@ import pytest
 from filelock import FileLock
 from jaxtyping import install_import_hook
 
-import tests.typecheck  # noqa: F401  the hook looks for it among the loaded modules
+import tests.typecheck
 
-install_import_hook(["weighttraj", "tipl"], "tests.typecheck.typecheck")
-
-import torch  # noqa: E402
+install_import_hook(tests.typecheck.checked_modules(), "tests.typecheck.typecheck")
 
 import weighttraj as wt  # noqa: E402
-from tests.small import SMALL_RECIPE  # noqa: E402
-from weighttraj.collect import PPOConfig, WeightTrajectoryCallback, collect, make_ppo  # noqa: E402
-from weighttraj.registry import create  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
     """Bit-equality holds at a fixed thread count only."""
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -41,35 +41,51 @@ def cache_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
 
 
 @pytest.fixture(scope="session")
-def full_run(tmp_path_factory: pytest.TempPathFactory) -> wt.Run:
-    """Three iterations of CleanRL's PPO at the paper's cadence, everything stored."""
-    torch.set_num_threads(1)
-    path = tmp_path_factory.mktemp("full") / "run.zarr"
-    config = PPOConfig(total_timesteps=3 * 2048)
-    callback = WeightTrajectoryCallback(path, critic=True, optimizer_moments=True)
-    make_ppo(config, seed=1).learn(config.total_timesteps, callback=callback)
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of what is made once for all worker processes, each under its lock."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    path = root / "shared"
+    path.mkdir(exist_ok=True)
+    return path
+
+
+@pytest.fixture(scope="session")
+def full_run(shared: Path) -> wt.Run:
+    """Three iterations of CleanRL's PPO at the paper's cadence, all stored. Do not write to it."""
+    import torch
+
+    from weighttraj.collect import PPOConfig, WeightTrajectoryCallback, make_ppo
+
+    path = shared / "full/run.zarr"
+    with FileLock(shared / "full.lock"):
+        if not path.exists():
+            torch.set_num_threads(1)
+            config = PPOConfig(total_timesteps=3 * 2048)
+            callback = WeightTrajectoryCallback(path, critic=True, optimizer_moments=True)
+            make_ppo(config, seed=1).learn(config.total_timesteps, callback=callback)
     return wt.open_run(path)
 
 
 @pytest.fixture(scope="session")
-def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_dataset(shared: Path) -> Path:
     """Two training runs and two test runs of 49 snapshots. Do not write to it."""
-    root = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:  # one for all worker processes
-        root = root.parent
-    with FileLock(root / "small.lock"):
-        collect(SMALL_RECIPE, root / "small")
-    return root / "small"
+    from tests.small import SMALL_RECIPE
+    from weighttraj.collect import collect
+
+    with FileLock(shared / "small.lock"):
+        collect(SMALL_RECIPE, shared / "small")
+    return shared / "small"
 
 
 @pytest.fixture(scope="session")
-def few_released(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def few_released(shared: Path) -> Path:
     """Five runs of the released data, which released models are for. Do not write to it."""
-    root = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        root = root.parent
-    path = root / "few/inverted-pendulum-v4-ppo-v1"
-    with FileLock(root / "few.lock"):
+    from weighttraj.registry import create
+
+    path = shared / "few/inverted-pendulum-v4-ppo-v1"
+    with FileLock(shared / "few.lock"):
         if not path.exists():
             path.parent.mkdir()
             chosen = wt.open("inverted-pendulum-v4-ppo-v1").select(seed=[0, 7, 30, 40, 41])
