@@ -12,75 +12,50 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tipl.checks.measures import check
-    from tipl.checks.results import Checks
-    from tipl.evaluation.config import EvaluateConfig
-    from tipl.forecaster import Forecaster
-    from tipl.models.baselines import (
-        Persistence,
-        Reconstruction,
-        fit_baselines,
-        save_baselines,
-    )
-    from tipl.models.tipl import TIPL, GPTConfig, TrainConfig, train
-    from tipl.registry import Kind, load, register
-    from tipl.report.page import evaluate
-    from tipl.representation import TemporalSVD
-    from tipl.training import LoopConfig, change
-    from tipl.zoo.remote import push
+    from tipl.checks.measures import check as check
+    from tipl.checks.results import Checks as Checks
+    from tipl.evaluation.config import EvaluateConfig as EvaluateConfig
+    from tipl.forecaster import Forecaster as Forecaster
+    from tipl.models.baselines import Persistence as Persistence
+    from tipl.models.baselines import Reconstruction as Reconstruction
+    from tipl.models.baselines import fit_baselines as fit_baselines
+    from tipl.models.baselines import save_baselines as save_baselines
+    from tipl.models.tipl import TIPL as TIPL
+    from tipl.models.tipl import GPTConfig as GPTConfig
+    from tipl.models.tipl import TrainConfig as TrainConfig
+    from tipl.models.tipl import train as train
+    from tipl.registry import Kind as Kind
+    from tipl.registry import load as load
+    from tipl.registry import register as register
+    from tipl.report.page import evaluate as evaluate
+    from tipl.representation import TemporalSVD as TemporalSVD
+    from tipl.training import LoopConfig as LoopConfig
+    from tipl.training import change as change
+    from tipl.zoo.remote import push as push
 
-_PLACES = {
-    "Checks": "tipl.checks.results",
-    "EvaluateConfig": "tipl.evaluation.config",
-    "Forecaster": "tipl.forecaster",
-    "GPTConfig": "tipl.models.tipl",
-    "Kind": "tipl.registry",
-    "LoopConfig": "tipl.training",
-    "Persistence": "tipl.models.baselines",
-    "Reconstruction": "tipl.models.baselines",
-    "TIPL": "tipl.models.tipl",
-    "TemporalSVD": "tipl.representation",
-    "TrainConfig": "tipl.models.tipl",
-    "change": "tipl.training",
-    "check": "tipl.checks.measures",
-    "evaluate": "tipl.report.page",
-    "fit_baselines": "tipl.models.baselines",
-    "load": "tipl.registry",
-    "push": "tipl.zoo.remote",
-    "register": "tipl.registry",
-    "save_baselines": "tipl.models.baselines",
-    "train": "tipl.models.tipl",
+_HOMES = {
+    "tipl.checks.measures": ("check",),
+    "tipl.checks.results": ("Checks",),
+    "tipl.evaluation.config": ("EvaluateConfig",),
+    "tipl.forecaster": ("Forecaster",),
+    "tipl.models.baselines": ("Persistence", "Reconstruction", "fit_baselines", "save_baselines"),
+    "tipl.models.tipl": ("TIPL", "GPTConfig", "TrainConfig", "train"),
+    "tipl.registry": ("Kind", "load", "register"),
+    "tipl.report.page": ("evaluate",),
+    "tipl.representation": ("TemporalSVD",),
+    "tipl.training": ("LoopConfig", "change"),
+    "tipl.zoo.remote": ("push",),
 }
-"""Module of each public name."""
+"""The public names that each module has."""
 
-__all__ = [
-    "TIPL",
-    "Checks",
-    "EvaluateConfig",
-    "Forecaster",
-    "GPTConfig",
-    "Kind",
-    "LoopConfig",
-    "Persistence",
-    "Reconstruction",
-    "TemporalSVD",
-    "TrainConfig",
-    "change",
-    "check",
-    "evaluate",
-    "fit_baselines",
-    "load",
-    "push",
-    "register",
-    "save_baselines",
-    "train",
-]
+__all__ = sorted(name for names in _HOMES.values() for name in names)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_PLACES[name]), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(home), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

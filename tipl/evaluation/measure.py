@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,23 +82,21 @@ class _Measurement(contextlib.ExitStack):
         self._run: Run = open_run(task.path)
         self._parts = Parts(task.config.out / "parts")
         self._starts = starts_of(self._run, task.config)
-        self._source = run_source(self._run)
+        self._return_starts = np.concatenate([self._starts.learning, self._starts.plateau])
         self._marks = {f.name: fingerprint(f) for f in task.forecasters}
         self._players: dict[int, Player] = {}
 
     def all(self) -> Measured:
         """Measure everything."""
-        starts, config = self._starts, self._config
+        starts, config, forecasters = self._starts, self._config, self._task.forecasters
         chosen = function_starts(starts, config)
         weights, functions = {}, {}
-        for forecaster in self._task.forecasters:
-            weights[forecaster.name] = self._get(
-                "weights", forecaster, starts.weights, config.horizons, squared_errors
-            )
+        for forecaster in forecasters:
+            name = forecaster.name
+            weights[name] = self._errors("weights", forecaster, starts.weights, squared_errors)
             if len(chosen):
-                functions[forecaster.name] = self._get(
-                    "policies", forecaster, chosen, config.horizons, divergences
-                )
+                functions[name] = self._errors("policies", forecaster, chosen, divergences)
+        with_returns = config.learning_starts > 0
         return Measured(
             run=self._run.id,
             starts=starts,
@@ -108,46 +106,82 @@ class _Measurement(contextlib.ExitStack):
             tensors=np.array([param.size for param in self._run.layout.params]),
             weights=weights,
             functions=functions,
-            true=self._true() if config.learning_starts else {},
-            returns={f.name: self._returns(f) for f in self._task.forecasters}
-            if config.learning_starts
-            else {},
+            true=self._true() if with_returns else {},
+            returns={f.name: self._returns(f) for f in forecasters} if with_returns else {},
         )
 
-    def _get(
-        self,
-        what: str,
-        forecaster: Forecaster,
-        starts: np.ndarray,
-        horizons: Sequence[int],
-        function: Any,
+    def _errors(
+        self, what: str, forecaster: Forecaster, starts: np.ndarray, function: Callable[..., Arrays]
     ) -> Arrays:
+        horizons = self._config.horizons
         return self._kept(
-            f"{what}/{forecaster.name}/{self._run.id}",
-            self._source
-            | {"forecaster": self._marks[forecaster.name]}
-            | {"starts": starts.tolist(), "horizons": list(horizons)},
+            f"{what}/{forecaster.name}",
+            {
+                "forecaster": self._marks[forecaster.name],
+                "starts": starts.tolist(),
+                "horizons": list(horizons),
+            },
             lambda tick: function(forecaster, self._run, starts, horizons, tick),
-            (what, len(starts)),
+            what,
+            len(starts),
         )
+
+    def _true(self) -> Arrays:
+        starts, config, run = self._return_starts, self._config, self._run
+        horizons = config.return_horizons
+
+        def play(tick: Tick) -> Arrays:
+            found = true_returns(self._player(config.seed), run, starts, horizons, tick)
+            fresh = self._player(config.seed + FRESH)
+            again = true_returns(fresh, run, starts, horizons[:1], lambda _: None)
+            return found | {"fresh": again["later"]}
+
+        count = len(MODES) * len(starts) * (1 + len(horizons))
+        return self._kept("returns/true", self._played(), play, "returns", count)
+
+    def _returns(self, forecaster: Forecaster) -> Arrays:
+        starts, horizons = self._return_starts, self._config.return_horizons
+
+        def play(tick: Tick) -> Arrays:
+            player = self._player(self._config.seed)
+            return forecast_returns(forecaster, player, self._run, starts, horizons, tick)
+
+        return self._kept(
+            f"returns/{forecaster.name}",
+            self._played() | {"forecaster": self._marks[forecaster.name]},
+            play,
+            "returns",
+            len(MODES) * len(starts) * len(horizons),
+        )
+
+    def _played(self) -> dict[str, Any]:
+        """Return what all returns depend on."""
+        config = self._config
+        return {
+            "starts": self._return_starts.tolist(),
+            "horizons": list(config.return_horizons),
+            "episodes": config.episodes,
+            "seed": config.seed,
+        }
 
     def _kept(
         self,
         name: str,
         source: dict[str, Any],
-        function: Callable[[Tick], Arrays],
-        work: tuple[str, int],
+        measure: Callable[[Tick], Arrays],
+        what: str,
+        work: int,
     ) -> Arrays:
         """Return stored arrays, or measure them now; report the same work in both cases."""
-        what, count = work
         done: list[int] = []
 
         def tick(some: int) -> None:
             done.append(some)
             self._tell(what, some)
 
-        arrays = self._parts.get(name, source, lambda: function(tick))
-        self._tell(what, count - sum(done))
+        name, source = f"{name}/{self._run.id}", run_source(self._run) | source
+        arrays = self._parts.get(name, source, lambda: measure(tick))
+        self._tell(what, work - sum(done))
         return arrays
 
     def _player(self, seed: int) -> Player:
@@ -155,45 +189,3 @@ class _Measurement(contextlib.ExitStack):
             player = Player(self._run, self._config.episodes, seed)
             self._players[seed] = self.enter_context(player)
         return self._players[seed]
-
-    def _return_starts(self) -> np.ndarray:
-        return np.concatenate([self._starts.learning, self._starts.plateau])
-
-    def _played(self, **more: Any) -> dict[str, Any]:
-        config = self._config
-        return self._source | {
-            "starts": self._return_starts().tolist(),
-            "horizons": list(config.return_horizons),
-            "episodes": config.episodes,
-            "seed": config.seed,
-            **more,
-        }
-
-    def _true(self) -> Arrays:
-        starts, config = self._return_starts(), self._config
-        arms, horizons = (self._run, starts), config.return_horizons
-
-        def play(tick: Tick) -> Arrays:
-            found = true_returns(self._player(config.seed), *arms, horizons, tick)
-            fresh = self._player(config.seed + FRESH)
-            again = true_returns(fresh, *arms, horizons[:1], lambda _: None)
-            return found | {"fresh": again["later"]}
-
-        count = len(MODES) * len(starts) * (1 + len(horizons))
-        return self._kept(f"returns/true/{self._run.id}", self._played(), play, ("returns", count))
-
-    def _returns(self, forecaster: Forecaster) -> Arrays:
-        starts, config = self._return_starts(), self._config
-        return self._kept(
-            f"returns/{forecaster.name}/{self._run.id}",
-            self._played(forecaster=self._marks[forecaster.name]),
-            lambda tick: forecast_returns(
-                forecaster,
-                self._player(config.seed),
-                self._run,
-                starts,
-                config.return_horizons,
-                tick,
-            ),
-            ("returns", len(MODES) * len(starts) * len(config.return_horizons)),
-        )

@@ -4,18 +4,11 @@ The basis at t is an SVD of the displacements ``phi_s - phi_t`` for s up to t: o
 the last ``window``. It comes from the eigenvectors of the smaller one of its two Gram matrices.
 When that is (snapshot, snapshot), its entries for all starts come from one reading of the run.
 
-For T snapshots of P parameters, a window of W (all: W = T) and d directions, in multiplications:
-
-| | P > W | P <= W |
-|---|---|---|
-| once, with one reading | T W P | none |
-| tokens of a start | 9 W^3 | W P^2 + 9 P^3 |
-| basis of a start | W P d more, and reads W snapshots | W P d more |
-| memory, numbers | T W + 2 W P | T P |
-
-On one core, a window of 256 of a run of HalfCheetah (T = 4,881, P = 71,948) takes 15 s once and
-10 ms a start; all its snapshots a minute once and half a minute a start. All snapshots of a run of
-InvertedPendulum (T = 1,951, P = 122) take 5 ms a start.
+For T snapshots of P parameters and a window of W < P, the reading takes T W P multiplications and a
+start 9 W^3; with P <= W, a start takes W P^2 + 9 P^3. On one core, a window of 256 of a run of
+HalfCheetah (T = 4,881, P = 71,948) takes 15 s once and 10 ms a start; all its snapshots take a
+minute once and half a minute a start. All snapshots of a run of InvertedPendulum (T = 1,951, P =
+122) take 5 ms a start.
 """
 
 from __future__ import annotations

@@ -67,14 +67,12 @@ class TemporalSVD:
     ) -> TemporalSVD:
         """Return the basis of a trajectory of any length, by a randomised SVD (Halko et al., 2011).
 
-        Reads the run ``power_iterations + 1`` times, a piece at a time. With w = rank +
-        oversampling, it takes ``(4 * power_iterations + 2) * w * T * P`` operations, where
-        an exact SVD takes ``4 * T * T * P`` and more, and keeps ``(power_iterations + 3) * w * P``
-        float64 in memory beside a piece.
+        Reads the run ``power_iterations + 1`` times, a piece at a time, and keeps
+        ``power_iterations + 3`` times ``(rank + oversampling) * P`` float64 in memory.
 
-        The leading singular values are the most accurate. On random walks and on a run of PPO on
-        HalfCheetah, with the defaults: the first 32 of 64 within 1e-5, the last within 2e-3; with
-        one power iteration more within 1e-9 and 3e-6. Apart from rounding they are never too
+        The leading singular values are the most accurate. With the defaults, on random walks and
+        on a run of PPO on HalfCheetah, the first 32 of 64 are within 1e-5, the last within 2e-3;
+        with one power iteration more, within 1e-9 and 3e-6. Apart from rounding they are never too
         large. The same seed and pieces give the same bits. Signs are as in ``fit``.
 
         Args:

@@ -29,11 +29,10 @@ def keep_settings(
     """Write the settings of a training beside the model; refuse to go on with other ones.
 
     Args:
-        out: folder of the model; made if it is not there.
-        settings: what JSON can hold.
-        may_differ: settings that can change from one start to the next.
-        defaults: values of the settings that a training did not write down because they did not
-            exist when it began.
+        out: folder of the model.
+        settings: all settings, for JSON.
+        may_differ: names of the settings that may change when the training goes on.
+        defaults: values of settings that did not exist yet when the training began.
 
     Raises:
         TrainError: the folder holds a training with other settings.
@@ -61,15 +60,7 @@ def save_state(
     n: int,
     average: Weights | None = None,
 ) -> None:
-    """Write all that a later process needs to go on into one file, replaced atomically.
-
-    Args:
-        out: folder of the model.
-        model: the network.
-        optimizer: its optimizer.
-        n: number of batches done.
-        average: the moving average of the weights, if there is one.
-    """
+    """Write all that a later process needs to go on after n batches into one file, atomically."""
     tensors = {f"model.{name}": t for name, t in model.state_dict().items()}
     for i, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{i}.{name}": t for name, t in state.items()}
@@ -79,11 +70,7 @@ def save_state(
 
 
 def read_state(out: Path) -> Weights:
-    """Return what ``save_state`` wrote; nothing if it has not written yet.
-
-    Raises:
-        TrainError: the file is damaged.
-    """
+    """Return what ``save_state`` wrote; nothing if it has not written yet."""
     file = out / "state.safetensors"
     if not file.exists():
         return {}

@@ -84,13 +84,11 @@ class Learner(ABC, Generic[E]):
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""] | Int[Tensor, ""]]:
         """Return a sum of errors over some examples and their count: the loss is the quotient.
 
-        Args:
-            network: what is called in place of ``self.network``.
-            batch: a batch, or a part of one.
+        ``network`` is called in place of ``self.network``; ``batch`` may be a part of a batch.
         """
 
     def validation(self) -> Sequence[E]:
-        """Return the examples of validation runs in parts; none if there are no such runs."""
+        """Return the examples of validation runs, in parts; none if there are no such runs."""
         return ()
 
     @abstractmethod
@@ -134,8 +132,8 @@ def train_network(
         ranks.from_first(lambda: keep_settings(out, settings, config.may_differ, defaults))
         loop.run()
         ranks.from_first(lambda: None)  # the model is there when any process returns
-        # The gradients' reducer holds the group of processes. If it outlives the group's end, torch
-        # waits in its destructor for a thread that waits for Python: the process never ends.
+        # The gradients' reducer holds the group of processes. If it outlives the group, torch waits
+        # in its destructor for a thread that waits for Python, and the process never ends.
         del learner, loop
         gc.collect()
 
@@ -192,11 +190,7 @@ class _Loop(Generic[E]):
                     total, count = 0.0, 0
 
     def step(self, n: int) -> float:
-        """Take gradient step n; return the loss of the whole batch before it.
-
-        Raises:
-            TrainError: the loss is no longer finite, or another process has ended.
-        """
+        """Take gradient step n; return the loss of the whole batch before it."""
         config, network = self._config, self._learner.network
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate_at(n)
@@ -282,11 +276,7 @@ class _Loop(Generic[E]):
         return torch.compile(network) if self._config.compile else network
 
     def _try_out(self) -> None:
-        """Differentiate one batch, so that what this machine cannot do is known at the start.
-
-        Raises:
-            TrainError: the compiler, the precision or the device is missing.
-        """
+        """Differentiate one batch, so that what this machine cannot do is known at the start."""
         config = self._config
         if (str(self._device), config.dtype, config.compile) == ("cpu", "float32", False):
             return
@@ -307,11 +297,7 @@ class _Loop(Generic[E]):
 
 
 def _moved(network: nn.Module, wanted: str) -> torch.device:
-    """Move a network to its device.
-
-    Raises:
-        TrainError: the device cannot be used.
-    """
+    """Move a network to its device."""
     device = device_here(wanted)
     try:
         network.to(device)

@@ -1,7 +1,7 @@
 """Trainings on starts of runs: what a model sees at a snapshot, and what followed.
 
-Each start counts with its own relative error, the squared error over the squared displacement, so
-that 1 is persistence. Every data set has an equal share of each batch.
+The loss is the mean over starts of the squared error over the squared displacement, so that 1 is
+persistence. Every data set has an equal share of each batch.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tipl.training.loop import Examples, Learner, train_network
 from weighttraj.progress import LoggedProgress
 
 LOOK_AT = 64
-"""Number of validation examples that are looked at together."""
+"""Number of validation examples in a part."""
 
 Example = dict[str, Tensor]
 """One start: tensors by name, among them ``energy`` (horizon,), the squared displacement, which is
@@ -66,11 +66,7 @@ class StartsConfig:
     """Sizes of the network, ``horizons`` and ``phases`` among them."""
 
     def check(self) -> None:
-        """Refuse numbers that make no training.
-
-        Raises:
-            TrainError: a number is too small.
-        """
+        """Refuse numbers that make no training."""
         check_settings(vars(self), {"starts": 1}, TrainError)
 
 
@@ -108,11 +104,7 @@ class StartsLearner(Learner[E]):
         return flat(self.config) | {"runs": runs}
 
     def prepare(self, console: Console) -> None:
-        """Read the examples of the training runs and of the validation runs.
-
-        Raises:
-            TrainError: no run can be trained on, or none is long enough for each horizon.
-        """
+        """Read the examples of the training runs and of the validation runs."""
         examples = self._gather(self.train, console)
         if examples is None:
             raise too_short(self.horizons)
@@ -186,9 +178,6 @@ def gather(
         examples_of: returns the examples of one run.
         seed: seed of starts and parameters.
         progress: progress callback, called with each run that was read.
-
-    Raises:
-        TrainError: there are runs, and none can be trained on.
     """
     found: list[Example] = []
     faults: dict[str, str] = {}
@@ -235,11 +224,7 @@ def fault_in_training(run: wt.Run) -> str | None:
 
 
 def cadence_of(runs: Sequence[wt.Run]) -> tuple[int | None, int]:
-    """Return the gradient steps from one snapshot to the next, and the snapshots of an iteration.
-
-    Raises:
-        TrainError: the runs differ.
-    """
+    """Return the gradient steps between two snapshots, and the snapshots of an iteration."""
     cadences = {every_of(run) for run in runs}
     if len(cadences) != 1:
         raise TrainError(
@@ -253,10 +238,9 @@ def cadence_of(runs: Sequence[wt.Run]) -> tuple[int | None, int]:
 
 
 def draw_starts(length: int, count: int, rng: np.random.Generator) -> list[int]:
-    """Return starts from 1 to the last but one, each once.
+    """Return starts from 1 to the last snapshot but one, each once.
 
-    Half of them are drawn evenly in time and half on a logarithmic scale, because the learning
-    phase is short.
+    Half of them are drawn uniformly and half on a logarithmic scale: the learning phase is short.
     """
     last = length - 2
     if last < 1:

@@ -37,7 +37,6 @@ class Causal(SavedNetwork[CausalGPT, CausalModelConfig]):
 
     name: str = "tipl-causal"
     kind = "causal"
-    causal = True
     config_type = CausalModelConfig
 
     @classmethod

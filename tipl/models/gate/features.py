@@ -1,8 +1,8 @@
 """From the history of a policy's weights to what the network sees.
 
-Everything is relative: steps are divided by the local scale of their tensor, and parameters are
-turned so that an average of their steps is positive. So the numbers are the same for a policy with
-other signs or another order of its hidden units, or with steps twice as long.
+Everything is relative: steps are divided by the local scale of their tensor, and by the sign of an
+average of the parameter's steps. So the numbers are the same for a policy with other signs or
+another order of its hidden units, or with steps twice as long.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from tipl.models.gate.network import LAG_COSINES, GateConfig, Input
 from tipl.structure import KINDS, Clock, Structure
 
 TINY = 1e-30
-"""Added to squares, so that what does not move is divided by something."""
+"""Added to squares, so that nothing is divided by 0."""
 ROWS = 4096
-"""Parameters that are looked at together: what is made of them stays in the caches."""
+"""Number of parameters that are computed together, so that they stay in the processor's caches."""
 _REFERENCE = 2
 """The average whose sign turns a parameter: beta 0.9."""
 _NEAR, _FAR = 1, 3
@@ -33,39 +33,39 @@ _NEAR, _FAR = 1, 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
-    """What the network sees of one start, until the history goes on.
+    """What the network sees of one start; valid until the history goes on.
 
-    Of tensors it is there at once; of parameters it is made when they are asked for, some at a
-    time: all of a large policy would not fit into the processor's caches.
+    Numbers of parameters are computed when they are asked for, some at a time: those of a large
+    policy would not fit into the processor's caches.
     """
 
     contexts: Float[Tensor, "tensor context"]
-    """Of each tensor."""
+    """Inputs of each tensor."""
     history: History
-    """Of the weights."""
+    """History of the weights."""
     config: GateConfig
-    """Of the network."""
+    """Sizes of the network."""
     scale: Float[Tensor, " param"]
     """RMS step of each parameter's tensor."""
     sizes: Float[Tensor, "size param"]
-    """How large steps and gradients of a parameter are beside those of others."""
+    """Sizes of a parameter's steps and gradients relative to others."""
     adam: Adam | None
-    """Moments of Adam, if the network sees them."""
+    """Adam's moments, if the network sees them."""
 
     def of(
         self, some: slice | Int[Tensor, " some"] = slice(None)
     ) -> tuple[Float[Tensor, "input some"], Float[Tensor, "basis some"]]:
-        """What is seen of some parameters, and their steps, averages and drift as they are."""
+        """Return the inputs of some parameters, and their basis: steps, averages and drift."""
         config, scale = self.config, self.scale[some]
         basis = self.history.basis[:, some]
-        if self.adam is not None:  # as long as a step of late
+        if self.adam is not None:  # as long as recent steps
             basis = torch.cat([basis, (self.adam.direction[some] * scale)[None]])
         inputs = basis * (torch.sign(basis[config.lags + _REFERENCE]) / scale)
         # A random walk's drift falls with the root of time.
         inputs[config.drift] *= max(self.history.t, 1) ** 0.5
         inputs = softsign(torch.cat([inputs, self.sizes[:, some]]))
         if config.without:
-            basis = basis.clone()  # it is the history's
+            basis = basis.clone()  # the history owns it
         for name in config.without:
             rows, _ = _places(name, config)
             basis[rows] = 0  # inputs begin with the basis
@@ -80,15 +80,7 @@ def features(
     config: GateConfig,
     adam: Adam | None = None,
 ) -> Features:
-    """What the network sees at the snapshot where the history ends.
-
-    Args:
-        history: of the weights.
-        structure: of the policy.
-        clock: of the run.
-        config: of the network.
-        adam: moments at the snapshot, if the network sees them.
-    """
+    """Return what the network sees at the snapshot where the history ends."""
     squares = history.squares
     own = structure.means(squares[None])[0]  # (tensor,)
     scale = (own + TINY).sqrt()[structure.tensor]
@@ -121,7 +113,7 @@ def features(
 
 
 def _places(name: Input, config: GateConfig) -> tuple[slice, slice]:
-    """Where a part is: among the numbers of a parameter, and among those of a tensor."""
+    """Return where an input is: among the numbers of a parameter, and those of a tensor."""
     averages, drift, sizes = config.lags, config.drift, config.basis
     size = config.course
     kind = size + 1
@@ -144,7 +136,7 @@ def _places(name: Input, config: GateConfig) -> tuple[slice, slice]:
 def _products(
     history: History, structure: Structure
 ) -> tuple[Float[Tensor, "tensor basis basis"], Float[Tensor, " tensor"]]:
-    """Mean products of the steps, averages and drift over each tensor, and its size."""
+    """Return mean products of steps, averages and drift over each tensor, and its size."""
     found = []
     for part in structure.slices:
         total: Any = 0
@@ -157,7 +149,7 @@ def _products(
 
 
 def pieces(part: slice) -> Iterator[slice]:
-    """A slice in pieces that the caches hold."""
+    """Yield a slice in pieces of ``ROWS``."""
     for first in range(part.start, part.stop, ROWS):
         yield slice(first, min(first + ROWS, part.stop))
 
@@ -168,13 +160,9 @@ def _course(
     t: int,
     config: GateConfig,
 ) -> Float[Tensor, "group number"]:
-    """How straight a group of parameters goes: cosines between its steps and averages; and sizes.
+    """Return how straight a group of parameters goes: cosines of steps and averages, and sizes.
 
-    Args:
-        products: means over the group of products of steps, averages and drift.
-        scale: mean squared step of each group.
-        t: number of the snapshot.
-        config: of the network.
+    ``products`` are means over each group, and ``scale`` is its mean squared step.
     """
     squared = products.diagonal(dim1=1, dim2=2)
     length = (squared + TINY).sqrt()
@@ -199,7 +187,7 @@ def _course(
 def _of_adam(
     adam: Adam, structure: Structure
 ) -> tuple[Float[Tensor, "1 param"], Float[Tensor, "tensor 3"]]:
-    """Sizes of gradients, and of what is left of them in their average: all without units."""
+    """Return sizes of gradients, and of their averages; both without units."""
     direction, gradient = (
         structure.means(of[None] ** 2)[0] for of in (adam.direction, adam.gradient)
     )
@@ -220,12 +208,12 @@ def _time(clock: Clock, t: int, phases: int) -> Float[Tensor, " number"]:
 
 
 def _log_ratio(squared: Tensor, scale: Tensor) -> Tensor:
-    """Logarithm of a size relative to a scale; both are squared."""
+    """Return the logarithm of a size relative to a scale, from the squares of both."""
     return (0.5 * torch.log((squared + TINY) / (scale + TINY))).clamp(-8, 8)
 
 
 def _shared(
     values: Float[Tensor, " param"], place: Int[Tensor, " param"]
 ) -> Float[Tensor, " param"]:
-    """For each parameter the mean over those that share its place."""
+    """Return for each parameter the mean over those with the same place."""
     return (torch.bincount(place, values) / torch.bincount(place))[place].to(values.dtype)

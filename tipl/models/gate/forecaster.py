@@ -38,7 +38,6 @@ class Gate(SavedNetwork[GateNetwork, GateModelConfig]):
 
     name: str = "tipl-gate"
     kind = "gate"
-    causal = True
     config_type = GateModelConfig
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The past of a run, a snapshot at a time: what a forecast needs of it fits into little memory."""
+"""The past of a run, a snapshot at a time, so that it takes little memory."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tipl.runs import weights_of
 from weighttraj import Run
 
 SQUARES_BETA = 0.95
-"""Of the average of squared steps, the local scale."""
+"""Decay of the average of squared steps, the local scale."""
 
 
 class History:
     """Steps of all parameters up to a snapshot, and averages of them.
 
-    Bias-corrected as Adam's: a run on a straight line has that line's step in every average.
+    Averages are bias-corrected as Adam's: on a straight line each one is the step of the line.
 
     Args:
         first: phi_0.
-        lags: steps that are kept.
-        betas: of the averages.
+        lags: number of steps that are kept.
+        betas: decays of the averages.
     """
 
     def __init__(
@@ -64,9 +64,9 @@ class History:
     def basis(self) -> Float[Tensor, "basis param"]:
         """The past of each parameter: steps, averages, and the mean step since phi_0.
 
-        The last steps come newest first, and are 0 before the beginning of the run; averages are
-        exponential moving ones of all steps, one for each beta. It is overwritten as the history
-        goes on: fresh memory for a large policy would take longer than what is written into it.
+        The last steps come newest first, and are 0 before the run; averages are exponential moving
+        ones, one for each beta. The memory is overwritten as the history goes on: to allocate it
+        for a large policy takes longer than to fill it.
         """
         if self._basis_of != self.t:
             lags, drift, t = self._lags, len(self._basis) - 1, self.t
@@ -85,13 +85,10 @@ class History:
 def histories(
     run: Run, starts: Sequence[int], lags: int, betas: Sequence[float]
 ) -> Iterator[tuple[int, History]]:
-    """Yield the history at each start, in the order of time.
+    """Yield the place of each start, in the order of time, and the history there.
 
-    A walk always begins at phi_0, so that a forecast does not depend on what was asked before; the
-    next call goes on where the last one of this run ended, if its starts come later.
-
-    Yields:
-        The place of a start among the starts, and the history there, valid until the next one.
+    The history is valid until the next one. It always begins at phi_0, so a forecast does not
+    depend on earlier calls; a call with later starts than the last one of this run goes on there.
     """
     key = (lags, tuple(betas))
     history = _WALKS.setdefault(run, {}).pop(key, None)

@@ -1,11 +1,10 @@
 """A network for one scalar parameter at a time, shared by all parameters of all policies.
 
-It does not output a displacement but *coefficients*, on steps that the parameter made before. So
-it is persistence before training, AR and EMA are special cases, and what it forecasts turns with
-the sign of a parameter and grows with the scale of its steps. It is a mixture of linear filters
-(Jordan and Jacobs, 1994): each *expert* is one filter for all; what a parameter did lately, and
-what its tensor and the whole policy did, says how much of each expert counts. One more filter is
-written for each tensor. This network is ours.
+Its outputs are *coefficients* of the steps that the parameter made before. So it is persistence
+before training, AR and EMA are special cases, and the forecast follows the sign of a parameter and
+the scale of its steps. It is a mixture of linear filters (Jordan and Jacobs, 1994): each *expert*
+is one filter for all parameters; the recent steps of a parameter, of its tensor and of the whole
+policy set the weight of each expert. Each tensor has one more filter. This network is ours.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from tipl.horizons import HORIZONS
 from tipl.structure import KINDS
 
 LAG_COSINES = 10
-"""Earlier steps that the last step is compared with."""
+"""Number of earlier steps that the last step is compared with."""
 
 Input = Literal["steps", "averages", "drift", "sizes", "course", "kind", "phase", "time", "rate"]
 """A part of what the network sees.
@@ -67,18 +66,12 @@ class GateConfig:
 
     @property
     def inputs(self) -> int:
-        """Number of inputs of a parameter: the basis, and step sizes of it, its row and column.
-
-        With Adam's moments also the size of its gradient.
-        """
+        """Number of inputs of a parameter: basis, three step sizes, and a size of its gradient."""
         return self.basis + 3 + self.adam
 
     @property
     def contexts(self) -> int:
-        """Number of inputs of a tensor: its course and the policy's, its kind, phase and time.
-
-        With Adam's moments also how far both follow their average gradient, and its size.
-        """
+        """Number of inputs of a tensor: course, size, kind, phase, time, and three of Adam."""
         return self.course + 1 + len(KINDS) + (self.phases + 1) + 3 + 3 * self.adam
 
     @property
@@ -119,13 +112,9 @@ class GateNetwork(nn.Module):
         basis: Float[Tensor, "*start param basis"],
         tensor: Int[Tensor, "*start param"],
     ) -> Float[Tensor, "*start param horizon"]:
-        """Return displacements, in units of the basis.
+        """Return displacements, in the units of the basis, which are steps and averages.
 
-        Args:
-            inputs: of each parameter; even in its sign.
-            contexts: of each tensor.
-            basis: steps and their averages.
-            tensor: which tensor a parameter belongs to.
+        The inputs do not change with the sign of a parameter; ``tensor`` is the tensor of each.
         """
         hidden = self.context(contexts)
 
@@ -147,21 +136,15 @@ class GateNetwork(nn.Module):
         basis: Float[Tensor, "basis param"],
         horizons: list[int],
     ) -> Float[Tensor, "horizon param"]:
-        """Return the same for parameters of one tensor and some horizons, in less time.
+        """Return the same for parameters of one tensor and some places of horizons, in less time.
 
-        Parameters come last here: what is added up then lies side by side in memory.
-
-        Args:
-            inputs: as in ``forward``.
-            context: of the tensor.
-            basis: as in ``forward``.
-            horizons: places of the wanted horizons.
+        Parameters come last here, so that what is added up lies side by side in memory.
         """
         hidden = self.context(context)
         count = len(self.experts)
         filters = torch.cat([self.experts, self.of_tensor(hidden)[None]])
         filters = filters.view(count + 1, *self.basis_scale.shape) * self.basis_scale
-        # Of all parameters of a tensor, the context is one more bias.
+        # The context is the same for all parameters of the tensor: one more bias.
         first = self.first.bias + self.first_context(hidden)
         second = self.second.bias + self.second_context(hidden)
         z = torch.addmm(first[:, None], self.first.weight, inputs).relu_()
@@ -175,9 +158,9 @@ class GateNetwork(nn.Module):
 
 
 def _basis_scale(config: GateConfig) -> Float[Tensor, "basis horizon"]:
-    """Return how far a displacement goes with a step, an average, or the mean step of the run.
+    """Return how far a displacement plausibly goes with a step, an average or the mean step.
 
-    A step says something of few to come; an average with beta of some 2 / (1 - beta) steps.
+    A step predicts few further ones; an average with beta about 2 / (1 - beta) steps.
     """
     steps = [[min(h, 5) ** 0.5 for h in config.horizons]] * config.lags
     averages = [[min(h, 2 / (1 - beta)) for h in config.horizons] for beta in config.betas]

@@ -32,10 +32,10 @@ class ScaledGateConfig(ModelConfig[GateConfig]):
 class ScaledGate(Forecaster):
     """phi_t + a_h d_h: the displacement d_h that tipl-gate forecasts, a_h times as long.
 
-    A least-squares forecast is short: it is the mean of the many ways that training may go. The
-    return rises along that mean, and further than it reaches. So a_h is chosen by returns, not by
-    errors of weights, which get worse. ``log_std``, the exploration noise, moves as tipl-gate says:
-    a_h is chosen with it held. This model is ours.
+    A least-squares forecast is short, because it is the mean of the many ways that training may go.
+    The return rises along that mean, and further than it reaches. So a_h is chosen by returns, not
+    by errors of weights, which get worse. The exploration noise ``log_std`` moves as tipl-gate
+    says: a_h is chosen with it held. This model is ours.
     """
 
     gate: Gate
@@ -45,17 +45,11 @@ class ScaledGate(Forecaster):
     name: str = "tipl-drift"
     """Name in tables and figures: of the folder that it was loaded from."""
     kind = "drift"
-    causal = True
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and the scaled displacement.
-
-        Raises:
-            ForecastError: there is no amplitude for such a horizon.
-            ModelError: the run has another cadence, or longer iterations.
-        """
+        """Return phi_t and the scaled displacement."""
         rows_of(list(self.amplitudes), horizons, self.name)
         factors = _factors(run.layout, [self.amplitudes[h] for h in horizons])
         out = np.empty((len(starts), *factors.shape), np.float32)
@@ -71,12 +65,7 @@ class ScaledGate(Forecaster):
 
     @classmethod
     def load(cls, path: str | Path) -> ScaledGate:
-        """Read a saved one; every parameter must be there.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the files are another's, or damaged.
-        """
+        """Read a saved one; every parameter must be there."""
         config = read_config(path, cls.kind, ScaledGateConfig)
         known = {str(h): h for h in config.network.horizons}
         if not config.amplitudes.keys() <= known.keys():
@@ -91,7 +80,7 @@ class ScaledGate(Forecaster):
 
 @dataclass(frozen=True, kw_only=True)
 class ScaledConfig:
-    """What a saved one says of itself; the scaled forecaster lies in a folder beside it."""
+    """What a saved one says of itself; the scaled forecaster is in a folder beside it."""
 
     amplitudes: dict[str, float]
     """Factor of the displacement at each horizon."""
@@ -120,11 +109,7 @@ class Scaled(Forecaster):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and the scaled displacement.
-
-        Raises:
-            ForecastError: the scaled forecaster makes no such forecast.
-        """
+        """Return phi_t and the scaled displacement."""
         check_request(run, starts, horizons)
         now = weights_of(run)[np.asarray(starts)][:, None]
         moved = self.along.forecast(run, starts, horizons) - now
@@ -140,13 +125,7 @@ class Scaled(Forecaster):
 
     @classmethod
     def load(cls, path: str | Path) -> Scaled:
-        """Read a saved one.
-
-        Raises:
-            FileNotFoundError: there is no forecaster in the folder.
-            ModelError: the scaled forecaster is not there.
-            ModelError: the files are another's, or damaged.
-        """
+        """Read a saved one."""
         config = read_config(path, cls.kind, ScaledConfig)
         if not config.amplitudes or not all(h.isdecimal() and int(h) for h in config.amplitudes):
             raise broken(path, f"amplitudes of {sorted(config.amplitudes)}, not of horizons")

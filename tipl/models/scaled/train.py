@@ -63,11 +63,7 @@ class ScaledTrainConfig:
     """Seed of the first episode."""
 
     def check(self) -> None:
-        """Refuse numbers that leave nothing to choose.
-
-        Raises:
-            TrainError: a number is too small, or there are no factors.
-        """
+        """Refuse numbers that leave nothing to choose."""
         numbers = dict.fromkeys(("horizons", "starts", "episodes"), 1) | {"seed": 0}
         check_settings(vars(self), numbers, TrainError)
         if not self.amplitudes or min(self.amplitudes) <= 0:
@@ -87,12 +83,8 @@ def train_scaled(
     The gain is that of ``tipl evaluate``: how much the forecast adds to the return, as a share of
     what training adds until then, summed over starts and runs. At equal gain the smaller one.
 
-    Args:
-        config: along which forecast, on what, and how much.
-        console: where progress is shown; None: nowhere.
-
     Returns:
-        a ``ScaledGate`` if a tipl-gate is scaled, else a ``Scaled``.
+        A ``ScaledGate`` if a tipl-gate is scaled, else a ``Scaled``.
 
     Raises:
         TrainError: there are no validation runs, or they do not learn; there are no factors; or the
@@ -157,14 +149,10 @@ def _settings(
 
 
 def gains_of(measured: Sequence[Arrays]) -> Float64[np.ndarray, "amplitude horizon"]:
-    """Return the inference gain of each amplitude, of sums over runs.
+    """Return the inference gain of each amplitude, from sums over runs.
 
-    Args:
-        measured: for each run ``forecast``, what the forecasts of each amplitude add to the return,
-            and ``training``, what training adds, summed over starts.
-
-    Raises:
-        TrainError: training adds nothing.
+    For each run, ``forecast`` is what the forecasts of each amplitude add to the return, and
+    ``training`` what training adds, summed over starts.
     """
     added = np.sum([one["forecast"] for one in measured], axis=0)
     by_training = np.sum([one["training"] for one in measured], axis=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +46,11 @@ class TokenRun:
     """Squared singular values over P."""
 
     @classmethod
-    def of(cls, embedded: Embedded) -> TokenRun:
-        """Return a run in the basis of its whole trajectory."""
+    def of(cls, embedded: Embedded, longest: int | None = None) -> TokenRun:
+        """Return a run, or its first snapshots, in the basis of its whole trajectory."""
         svd = embedded.svd
         return cls(
-            coefficients=embedded.coefficients.astype(np.float32),
+            coefficients=embedded.coefficients[:longest].astype(np.float32),
             weights=(svd.singular_values**2 / svd.components.shape[1]).astype(np.float32),
         )
 
@@ -77,14 +77,8 @@ class TokenSampler:
     """Draws random windows; batch n is a function of (seed, n) alone.
 
     Our choice, where the paper is silent: windows end at each snapshot that has a successor with
-    equal probability, with replacement; the first ones of a run are padded on the left, as Decision
-    Transformer's are.
-
-    Args:
-        runs: runs in coefficients.
-        window: number of snapshots in a window, K.
-        batch_size: number of windows in a batch.
-        seed: seed of the order.
+    equal probability, with replacement; the first ones of a run are padded on the left, as in
+    Decision Transformer.
 
     Raises:
         TrainError: there are no runs, or one has fewer than two snapshots.
@@ -125,13 +119,9 @@ class TokenSampler:
         return self._windows(self._run[pick], self._t[pick])
 
     def tiles(self, most: int) -> list[Windows]:
-        """Return windows side by side that predict each snapshot of each run once, but phi_0.
+        """Return adjacent windows, which predict each snapshot but phi_0 once, in batches.
 
-        Args:
-            most: largest number of windows; if there are more, evenly spaced ones are taken.
-
-        Returns:
-            parts of at most ``batch_size`` windows.
+        If there are more windows than ``most``, evenly spaced ones are taken.
         """
         ends = [np.arange(n - 2, -1, -self.window) for n in self._lengths]
         run, t = np.repeat(np.arange(len(ends)), [len(e) for e in ends]), np.concatenate(ends)
@@ -157,10 +147,9 @@ class TokenSampler:
 def history(
     coefficients: Float[np.ndarray, "time rank"], t: Int[np.ndarray, " start"], window: int
 ) -> tuple[Float[Tensor, "start window rank"], Int[Tensor, "start window"]]:
-    """Return windows that end at each t, padded on the left with zeros.
+    """Return windows that end at each t, padded on the left with 0, and the index of each row.
 
-    Returns:
-        the coefficients, and the index of each row, negative in padding.
+    The index is negative in padding.
     """
     steps = np.asarray(t)[:, None] + np.arange(-window + 1, 1)
     tokens = coefficients[np.maximum(steps, 0)] * (steps >= 0)[..., None]
@@ -168,14 +157,9 @@ def history(
 
 
 def prepare(data: str | Path, *, rank: int, window: int) -> Prepared:
-    """Read the runs of a data set and fit a basis to each, as the paper does: to the whole run.
+    """Read the runs of a data set and fit a basis to each whole run, as the paper does.
 
-    The bases of validation runs are fitted in the same way. The paper has no validation runs.
-
-    Args:
-        data: a data set with runs in the split ``train``.
-        rank: number of coefficients of a token, d.
-        window: number of snapshots in a window, K.
+    The paper has no validation runs; here their bases are fitted in the same way.
 
     Raises:
         FormatError: no run is in the split ``train``.
@@ -198,16 +182,12 @@ def prepare(data: str | Path, *, rank: int, window: int) -> Prepared:
     return Prepared(
         train=[_tokens(run, rank) for run in train],
         # The model has no time embedding for what comes after the longest training run.
-        validation=[_cut(_tokens(run, rank), longest) for run in held_out],
+        validation=[_tokens(run, rank, longest) for run in held_out],
         every=every_of(train[0]),
         parameters=train[0].layout.size,
         longest=longest,
         checksums={run.id: checksum_of(run) for run in train},
     )
-
-
-def _cut(run: TokenRun, longest: int) -> TokenRun:
-    return replace(run, coefficients=run.coefficients[:longest])
 
 
 def _check_alike(runs: Sequence[wt.Run], data: str | Path) -> None:
@@ -229,9 +209,9 @@ def _check_alike(runs: Sequence[wt.Run], data: str | Path) -> None:
                 )
 
 
-def _tokens(run: wt.Run, rank: int) -> TokenRun:
+def _tokens(run: wt.Run, rank: int, longest: int | None = None) -> TokenRun:
     try:
-        return TokenRun.of(embed(run, rank))
+        return TokenRun.of(embed(run, rank), longest)
     except RepresentationError as error:
         raise TrainError(
             f"run {run.id} has no such coefficients",

@@ -63,12 +63,7 @@ class TIPL(SavedNetwork[GPT, TIPLConfig]):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return forecasts by feeding each prediction back as the next token.
-
-        Raises:
-            ModelError: the run has another cadence, policies of another size, or goes on after the
-                last time embedding.
-        """
+        """Return forecasts; each prediction is fed back as the next token."""
         check_request(run, starts, horizons)
         self._check(run, max(starts) + max(horizons))
         embedded = embed(run, self.config.gpt.rank)
@@ -83,7 +78,7 @@ class TIPL(SavedNetwork[GPT, TIPLConfig]):
         starts: Int[np.ndarray, " start"],
         steps: int,
     ) -> Float[np.ndarray, "start step rank"]:
-        """Return so many further rows of coefficients after each start."""
+        """Return ``steps`` further rows of coefficients after each start."""
         self.network.eval()
         device = self.network.input_mean.device
         tokens, index = history(coefficients, starts, self.config.gpt.block_size)

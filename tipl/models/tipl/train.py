@@ -23,7 +23,7 @@ from tipl.training.config import defaults_of, flat
 from tipl.training.parallel import Ranks
 
 VALIDATION_SHARE = 0.01
-"""Share of the training's time that validation may take. A forward pass is a third of a step."""
+"""Share of the training's time for validation. A forward pass takes a third of a step."""
 NETWORK = GPTConfig()
 """Decision Transformer's sizes."""
 LOOP = LoopConfig(
@@ -80,14 +80,14 @@ class TrainConfig:
 def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
     """Train TIPL, or go on where the training stopped; load it if the training has ended.
 
-    Under `torchrun` each process takes its share of every batch. The training is the same but for
-    rounding and dropout, which each process draws for its own windows::
+    Under `torchrun` each process takes its share of every batch. Only rounding and dropout differ,
+    which each process draws for its own windows::
 
         torchrun --standalone --nproc-per-node 2 -m tipl train tipl --data DATA --out OUT
 
-    Each line of the log has the mean training WPE since the line before, with dropout; and, where
-    the data set has a validation split, the WPE one step ahead on its runs, without dropout. By
-    default no model is chosen by it: the paper has no validation runs.
+    Each line of the log has the mean training WPE since the line before, with dropout, and the WPE
+    one step ahead on validation runs, if there are any, without dropout. By default it does not
+    choose the model: the paper has no validation runs.
 
     Raises:
         TrainError: the data do not fit, or as ``train_network``.
@@ -169,7 +169,7 @@ def weight_prediction_error(
     """Return the WPE of policy weights within the subspace, summed over rows without padding.
 
     Directions are orthonormal, so ``P * MSE(phi, phi~) = sum_k sigma_k^2 (u_k - u~_k)^2``: the
-    paper's loss needs no decoding. Each window weighs errors with its own run's singular values.
+    paper's loss needs no decoding. The singular values are those of each window's run.
     """
     squared = (predicted - batch.targets) ** 2 * batch.weights[:, None, :]
     return (squared.sum(-1) * batch.mask).sum()
