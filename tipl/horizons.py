@@ -1,4 +1,4 @@
-"""How many snapshots ahead the fitted forecasters look."""
+"""Horizons: numbers of snapshots ahead."""
 
 from __future__ import annotations
 
@@ -11,22 +11,14 @@ HORIZONS = (*range(1, 11), 20, 50, 100, 200)
 
 
 def fitted(horizons: Sequence[int]) -> tuple[int, ...]:
-    """Return the horizons to fit, rising, each once.
-
-    Raises:
-        TrainError: there are none, or one is below 1.
-    """
+    """Return the horizons to fit, rising, each once; refuse an empty list, and those below 1."""
     if not len(horizons) or min(horizons) < 1:
         raise TrainError("there is nothing to fit", expected="horizons from 1", got=list(horizons))
     return tuple(sorted(set(horizons)))
 
 
 def rows_of(known: Sequence[int], wanted: Sequence[int], name: str) -> list[int]:
-    """Return the places of the wanted horizons among those that were fitted.
-
-    Raises:
-        ForecastError: one was not fitted.
-    """
+    """Return the places of the wanted horizons among those that were fitted; refuse others."""
     if missing := sorted(set(wanted) - set(known)):
         raise ForecastError(
             "the forecaster was not fitted for this horizon",

@@ -1,4 +1,4 @@
-"""Settings that make no sense are refused before anything is read or written."""
+"""Refuses invalid settings before anything is read or written."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from weighttraj.errors import WeightTrajError
 def check_settings(
     settings: Mapping[str, Any], least: Mapping[str, float], error: type[WeightTrajError]
 ) -> None:
-    """Refuse numbers that are too small, and lists without any.
+    """Refuse numbers that are too small, and empty lists.
 
     Args:
-        settings: by name, these and others.
-        least: the smallest that each may be, or each number of its list.
-        error: what is raised.
+        settings: values by name; others are ignored.
+        least: smallest value of each setting, or of each number in its list.
+        error: type of the error.
     """
     wrong = {name: value for name, low in least.items() if not _fits(value := settings[name], low)}
     if wrong:
         raise error(
-            "these settings will not do",
+            "invalid settings",
             expected=", ".join(f"{name} of at least {least[name]:g}" for name in wrong),
             got=", ".join(f"{name} {_told(value)}" for name, value in wrong.items()),
             do="change them",
@@ -29,10 +29,10 @@ def check_settings(
 
 
 def check_heads(n_embd: int, n_head: int, error: type[WeightTrajError]) -> None:
-    """Refuse a stream that heads cannot share equally."""
+    """Refuse a width that the heads cannot share equally."""
     if n_embd % n_head:
         raise error(
-            "the heads cannot share the stream",
+            "the attention heads cannot share the width equally",
             expected="n_embd a multiple of n_head",
             got=f"n_embd {n_embd}, n_head {n_head}",
             do="change one of them",

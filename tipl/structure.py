@@ -1,8 +1,4 @@
-"""What a run says beside its weights: which parameters belong together, and the time of snapshots.
-
-Our networks see relative quantities of these only, which are the same for a policy with its hidden
-units in another order.
-"""
+"""What networks see of a run beside its weights: groups of parameters and the time of snapshots."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from torch import Tensor
 from weighttraj import ParamLayout, Run
 
 KINDS = ("input weight", "hidden weight", "output weight", "hidden bias", "output bias", "other")
-"""What a tensor is in a policy."""
+"""Kinds of tensors of a policy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +24,9 @@ class Structure:
     row: Int[Tensor, " param"]
     """Row of its tensor, counted over all tensors; of a vector, each element."""
     column: Int[Tensor, " param"]
-    """The same of columns."""
+    """The same for columns."""
     kind: Int[Tensor, " tensor"]
-    """Place in ``KINDS``."""
+    """Kind of each tensor, a place in ``KINDS``."""
     slices: tuple[slice, ...]
     """Parameters of each tensor."""
 
@@ -68,11 +64,11 @@ class Clock:
     phase: Int[np.ndarray, " time"]
     """Part of its iteration that ends at a snapshot; -1: unset."""
     rate: Float[np.ndarray, " time"]
-    """Learning rate over the first one; 1 where it is not recorded."""
+    """Learning rate relative to the first one; 1 where it is not recorded."""
 
     @classmethod
     def of(cls, run: Run) -> Clock:
-        """Return the times of a run."""
+        """Return phases and learning rates of a run."""
         rates = np.asarray(run.learning_rate, np.float64)
         known = rates[np.isfinite(rates)]
         first = known[0] if len(known) else 1.0

@@ -11,10 +11,10 @@ from threadpoolctl import threadpool_limits
 
 @contextmanager
 def threads(count: int = 1) -> Iterator[None]:
-    """Let torch and NumPy compute with so many threads.
+    """Let torch and NumPy use ``count`` threads.
 
-    Threads of a small product wait for each other in a loop, and where another process has their
-    core they wait for that too: a Temporal SVD then takes up to thirty times as long.
+    Threads of a small product wait for each other in a loop. Where other processes use the cores, a
+    Temporal SVD with several threads takes up to thirty times as long.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -37,7 +37,7 @@ class EvaluateCommand(EvaluateConfig):
     """Folders of models and of fitted baselines; names of models of the zoo, or of baselines that
     need no fit (``ema-0.95``, say); or classes, ``module:Class``."""
     workers: int = 1
-    """Number of processes, each with one thread; each takes a run at a time."""
+    """Number of processes; each has one thread and takes a run at a time."""
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
     """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
@@ -47,15 +47,12 @@ def evaluate(args: EvaluateCommand) -> None:
     console = Output()
     new_path(args.out)
     forecasters = [load(name) for name in args.forecasters]
-    config = EvaluateConfig(
-        **{field.name: getattr(args, field.name) for field in fields(EvaluateConfig)}
-    )
     results = evaluate_all(
-        forecasters, config, workers=args.workers, imports=args.imports, console=console
+        forecasters, args, workers=args.workers, imports=args.imports, console=console
     )
     console.print(_table(results, console))
     say(verdict(results))
-    say(f"report: {config.out / 'report.html'}")
+    say(f"report: {args.out / 'report.html'}")
     if results.left_out:
         for run, why in results.left_out.items():
             Output(stderr=True).print(f"not evaluated: run {run}: {escape(why)}", soft_wrap=True)
@@ -77,8 +74,8 @@ def check(
 ) -> None:
     """Run five tests that a causal forecaster should pass, and write what they measured.
 
-    Whether it finds something in random walks, looks ahead, follows permuted and flipped units and
-    longer steps, and goes on along a line.
+    They show whether it finds something in random walks, looks ahead, follows permuted and flipped
+    units and longer steps, and goes on along a line.
     """
     if new_path(out).is_dir():
         raise IsADirectoryError(f"--out {out} is a folder: name a JSON file")

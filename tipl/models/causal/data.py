@@ -1,4 +1,4 @@
-"""The path of a run up to a start, as tipl-causal sees it, and the examples it is trained on."""
+"""What tipl-causal sees of a run at a start, and the examples that it is trained on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from weighttraj import Run
 SCALE_STEPS = 20
 """Number of steps whose RMS norm is the unit."""
 POOL = 4096
-"""Number of parameters of a run that its displacements are measured on."""
+"""Number of sampled parameters of a run, to measure displacements."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +119,7 @@ def local_scale(
 
 
 def bases_of(run: Run, config: CausalConfig, ahead: int = 0) -> PrefixBases:
-    """Return the bases of all starts of a run; they are kept as long as the run is open."""
+    """Return the bases of all starts of a run, which are kept as long as the run is open."""
     key = (config.rank, config.window, ahead)
     known = _KNOWN.setdefault(run, {})
     if key not in known:
