@@ -20,13 +20,17 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import jinja2
 
 from tipl.errors import EvaluateError
 from tipl.evaluation.results import Results
 from tipl.report.figures import figures, file_name, titles
 from tipl.report.tables import Table, cell, headline, label, tables
-from tipl.report.verdict import paragraphs, verdict
+from tipl.report.verdict import paragraphs
 
+SECTIONS = ("overview", "verdict", "tables", "figures", "source")
 DPI = 110
 """Resolution of pictures in Markdown pages."""
 
@@ -103,15 +107,45 @@ def render(results: Results, source: Path, section: str) -> str:
     Raises:
         EvaluateError: there is no such section.
     """
-    if section not in _SECTIONS:
+    if section not in SECTIONS:
         raise EvaluateError(
             "there is no such section of results",
-            expected=", ".join(_SECTIONS),
+            expected=", ".join(SECTIONS),
             got=section,
             where=source,
             do="change the marker in the page",
         )
-    return _SECTIONS[section](results, source)
+    context = {
+        "results": results,
+        "file": source,
+        "causal": [name for name, scores in results.forecasters.items() if scores.causal],
+        "all_tables": tables,
+        "file_name": file_name,
+        "headline": headline,
+        "paragraphs": paragraphs,
+        "table_lines": table_lines,
+        "titles": titles,
+    }
+    return section_of("results.md", section, context)
+
+
+def templates() -> jinja2.Environment:
+    """Return the environment of Markdown templates."""
+    loader = jinja2.PackageLoader("tipl", "templates")
+    environment = jinja2.Environment(  # noqa: S701  Markdown, from our own templates
+        loader=loader,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["label"] = label
+    return environment
+
+
+def section_of(template: str, section: str, context: dict[str, Any]) -> str:
+    """Return the text of a section: of the macro of this name in a template."""
+    sections: Any = templates().get_template(template).make_module(context)
+    return str(getattr(sections, section)()).strip("\n")
 
 
 def table_lines(table: Table) -> list[str]:
@@ -133,62 +167,3 @@ def _place(match: re.Match[str]) -> Place:
         section=match["section"] or "overview",
         empty=not match["content"].strip(),
     )
-
-
-def _overview(results: Results, _: Path) -> str:
-    table = headline(results)
-    return "\n".join([*table_lines(table), "", verdict(results)])
-
-
-def _verdict(results: Results, _: Path) -> str:
-    return "\n".join(f"- {paragraph}" for paragraph in paragraphs(results))
-
-
-def _tables(results: Results, _: Path) -> str:
-    found = tables(results)
-    lines = []
-    for table in sorted(found, key=lambda table: not table.main):
-        if table.main:
-            lines += [f"**{table.title}**", "", *table_lines(table), ""]
-        else:
-            lines += [f"<details><summary>{table.title}</summary>", "", *table_lines(table)]
-            lines += ["", "</details>", ""]
-    ahead = [label(name) for name, s in results.forecasters.items() if not s.causal]
-    if ahead:
-        lines.append(f"Not causal, they have seen the future of the run: {', '.join(ahead)}.")
-    return "\n".join(lines).rstrip()
-
-
-def _figures(results: Results, source: Path) -> str:
-    links = [f"![{title}]({source.stem}/{file_name(title)})" for title in titles(results)]
-    return "\n\n".join(links)
-
-
-def _source(results: Results, source: Path) -> str:
-    runs, starts = results.runs, results.starts
-    lines = [
-        f"- data: `{results.data}`, version {results.version}; {len(runs)} runs of its "
-        f"{results.split} split: {', '.join(runs)}",
-        f"- starts: {starts.weights:,} for weights, {starts.policies:,} for policies",
-    ]
-    if results.modes:
-        lines[-1] += (
-            f", {starts.learning:,} in the learning phase and {starts.plateau:,} after it "
-            "for returns"
-        )
-        lines.append(
-            f"- {results.episodes} episodes for the return of a policy, the same starts for all"
-        )
-    if results.quick:
-        lines.append("- a quick look, with fewer starts and episodes")
-    lines += [f"- left out: {run}: {why}" for run, why in results.left_out.items()]
-    return "\n".join([*lines, f"- made by `{results.command}`", f"- all numbers: `{source}`"])
-
-
-_SECTIONS: dict[str, Callable[[Results, Path], str]] = {
-    "overview": _overview,
-    "verdict": _verdict,
-    "tables": _tables,
-    "figures": _figures,
-    "source": _source,
-}

@@ -18,7 +18,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import msgspec
 from matplotlib.figure import Figure
 
@@ -26,7 +25,7 @@ from tipl import registry
 from tipl.checks.results import CheckResults
 from tipl.errors import ModelError
 from tipl.report.figures import svg
-from tipl.report.markdown import rewrite, table_lines
+from tipl.report.markdown import rewrite, section_of, table_lines, templates
 from tipl.report.scores import PERSISTENCE, oracles, row_at, wpe
 from tipl.report.tables import headline, label
 from tipl.report.verdict import verdict
@@ -81,17 +80,7 @@ def metrics_of(name: str) -> Metrics:
 def new_card(metrics: Metrics) -> str:
     """Return a card from the template of its kind, or the one for all; its places are empty."""
     wanted = [f"card-{metrics.kind}.md", "card.md"]
-    return _templates().select_template(wanted).render(metrics=metrics)
-
-
-def _templates() -> jinja2.Environment:
-    loader = jinja2.PackageLoader("tipl", "templates")
-    return jinja2.Environment(  # noqa: S701  Markdown, from our own templates
-        loader=loader,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-        undefined=jinja2.StrictUndefined,
-    )
+    return templates().select_template(wanted).render(metrics=metrics)
 
 
 def refreshed(card: str, metrics: Metrics) -> str:
@@ -129,8 +118,7 @@ def facts(metrics: Metrics, section: str) -> str:
         "table_lines": table_lines,
         "verdict": verdict,
     }
-    sections: Any = _templates().get_template("facts.md").make_module(context)
-    return str(getattr(sections, section)()).strip("\n")
+    return section_of("facts.md", section, context)
 
 
 def training_figure(metrics: Metrics) -> Figure:
