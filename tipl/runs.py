@@ -6,13 +6,14 @@ that map.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, runtime_checkable
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -21,6 +22,9 @@ from jaxtyping import Float, Float32, Int
 from tipl.errors import LeftOutWarning
 from weighttraj import Run
 from weighttraj.load import CachedWeights
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 BLOCK_BYTES = 2**27
 """Bytes of the rows that are read at once when columns are picked."""
@@ -44,6 +48,21 @@ class Rows(Protocol):
         """Rows of a slice (and, after a comma, columns)."""
 
 
+def while_open(function: Callable[Concatenate[Run, P], T]) -> Callable[Concatenate[Run, P], T]:
+    """Keep what a function of a run returns as long as the run is open, for each argument."""
+    known: WeakKeyDictionary[Run, dict[Any, T]] = WeakKeyDictionary()
+
+    @functools.wraps(function)
+    def kept(run: Run, /, *args: P.args, **options: P.kwargs) -> T:
+        results, key = known.setdefault(run, {}), (args, *sorted(options.items()))
+        if key not in results:
+            results[key] = function(run, *args, **options)
+        return results[key]
+
+    return kept
+
+
+@while_open
 def weights_of(run: Run) -> Float32[np.ndarray, "time param"]:
     """Return the weights of a run: a read-only memory map, decoded when it is first needed.
 
@@ -54,18 +73,15 @@ def weights_of(run: Run) -> Float32[np.ndarray, "time param"]:
         CacheError: the cache's folder cannot be used.
         DamageError: the run is damaged.
     """
-    if run not in _KNOWN:
-        complete = run.info.status == "complete"
-        _KNOWN[run] = CachedWeights(run) if complete else np.asarray(run.weights[:], np.float32)
-    known = _KNOWN[run]
-    return known.map() if isinstance(known, CachedWeights) else known
+    if run.info.status == "complete":
+        return CachedWeights(run).map()
+    return np.asarray(run.weights[:], np.float32)
 
 
+@while_open
 def checksum_of(run: Run) -> str:
     """Return the SHA-256 (hex) of the checksums of a run's snapshots: equal weights, equal sum."""
-    if run not in _CHECKSUMS:
-        _CHECKSUMS[run] = hashlib.sha256(run["digest"][:].tobytes()).hexdigest()
-    return _CHECKSUMS[run]
+    return hashlib.sha256(run["digest"][:].tobytes()).hexdigest()
 
 
 @contextmanager
@@ -137,7 +153,3 @@ def without_faults(
 def warn_left_out(run: str, why: str) -> None:
     """Warn that a run, named by its id, is left out."""
     warnings.warn(f"run {run} is left out: {why}", LeftOutWarning, stacklevel=4)
-
-
-_KNOWN: WeakKeyDictionary[Run, CachedWeights | np.ndarray] = WeakKeyDictionary()
-_CHECKSUMS: WeakKeyDictionary[Run, str] = WeakKeyDictionary()

@@ -8,7 +8,6 @@ of U, cut to the first d columns.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from tipl.errors import RepresentationError
 from tipl.representation.randomised import leading
 from tipl.representation.rows import RunOrRows, Snapshots
+from tipl.runs import while_open
 from weighttraj import Run
 
 EXACT_WORK = 10**9
@@ -143,6 +143,7 @@ class Embedded:
     """Row t stands for phi_t."""
 
 
+@while_open
 def embed(run: Run, rank: int) -> Embedded:
     """Return a run in d coefficients, as the paper represents it.
 
@@ -152,14 +153,8 @@ def embed(run: Run, rank: int) -> Embedded:
     Raises:
         RepresentationError: as ``TemporalSVD.fit``.
     """
-    known = _EMBEDDED.setdefault(run, {})
-    if rank not in known:
-        svd = fit_run(run, rank)
-        known[rank] = Embedded(svd=svd, coefficients=svd.coefficients(run))
-    return known[rank]
-
-
-_EMBEDDED: WeakKeyDictionary[Run, dict[int, Embedded]] = WeakKeyDictionary()
+    svd = fit_run(run, rank)
+    return Embedded(svd=svd, coefficients=svd.coefficients(run))
 
 
 def fit_run(trajectory: RunOrRows, rank: int, *, seed: int = 0) -> TemporalSVD:

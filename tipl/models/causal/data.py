@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from tipl.models.causal.network import CausalConfig
 from tipl.representation import PrefixBases, PrefixTokens
-from tipl.runs import columns_of, stratified, weights_of
+from tipl.runs import columns_of, stratified, weights_of, while_open
 from tipl.structure import Clock, Structure
 from tipl.training.starts import Example, StartExamples, draw_starts
 from weighttraj import Run
@@ -118,13 +117,7 @@ def local_scale(
     return float(np.sqrt((np.diff(rows, axis=0) ** 2 * counts).sum(1).mean()))
 
 
+@while_open
 def bases_of(run: Run, config: CausalConfig, ahead: int = 0) -> PrefixBases:
     """Return the bases of all starts of a run, which are kept as long as the run is open."""
-    key = (config.rank, config.window, ahead)
-    known = _KNOWN.setdefault(run, {})
-    if key not in known:
-        known[key] = PrefixBases.fit(run, config.rank, window=config.window, ahead=ahead)
-    return known[key]
-
-
-_KNOWN: WeakKeyDictionary[Run, dict[tuple[int, int, int], PrefixBases]] = WeakKeyDictionary()
+    return PrefixBases.fit(run, config.rank, window=config.window, ahead=ahead)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from tipl.runs import weights_of
+from tipl.runs import weights_of, while_open
 from weighttraj import Run
 
 SQUARES_BETA = 0.95
@@ -90,17 +89,18 @@ def histories(
     The history is valid until the next one. It always begins at phi_0, so a forecast does not
     depend on earlier calls; a call with later starts than the last one of this run goes on there.
     """
-    key = (lags, tuple(betas))
-    history = _WALKS.setdefault(run, {}).pop(key, None)
-    first = min(starts)
-    if history is None or history.t > first:
-        history = History(weights_of(run)[0], lags, betas)
-    weights = weights_of(run)
+    walks, key, weights = _walks(run), (lags, tuple(betas)), weights_of(run)
+    history = walks.pop(key, None)
+    if history is None or history.t > min(starts):
+        history = History(weights[0], lags, betas)
     for place in np.argsort(np.asarray(starts), kind="stable").tolist():
         while history.t < starts[place]:
             history.push(weights[history.t + 1])
         yield place, history
-    _WALKS[run][key] = history
+    walks[key] = history
 
 
-_WALKS: WeakKeyDictionary[Run, dict[tuple[int, tuple[float, ...]], History]] = WeakKeyDictionary()
+@while_open
+def _walks(run: Run) -> dict[tuple[int, tuple[float, ...]], History]:
+    """Return the histories where walks along a run ended; none at first."""
+    return {}
