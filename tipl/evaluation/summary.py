@@ -15,7 +15,6 @@ from tipl.evaluation.returns import MODES
 from tipl.evaluation.starts import shares
 from tipl.evaluation.statistics import (
     Bootstrap,
-    Cell,
     interquartile_mean,
     mean,
     quotient,
@@ -104,8 +103,7 @@ class Summary:
                 for error, copy, boundary, share in runs
             ]
             samples = (np.stack(part) for part in zip(*each, strict=True))
-            cells = self._bootstrap.interval(_SKILLS[aggregate], *samples)
-            found[kind] = self._rows(self._config.horizons, cells)
+            found[kind] = self._rows(self._config.horizons, _SKILLS[aggregate], *samples)
         return found
 
     def _wpe(self, name: str) -> Rows:
@@ -115,17 +113,14 @@ class Summary:
             / size
             for m in self._measured
         ]
-        return self._rows(self._config.horizons, self._bootstrap.interval(mean, np.stack(each)))
+        return self._rows(self._config.horizons, mean, np.stack(each))
 
     def _repw(self, name: str) -> dict[str, dict[str, Rows]]:
         """Return |J(true) - J(forecast)|, means over the starts of each run."""
         horizons = self._config.return_horizons
         return {
             mode: {
-                phase: self._rows(
-                    horizons, self._bootstrap.interval(mean, self._gaps(name, i, phase))
-                )
-                for phase in PHASES
+                phase: self._rows(horizons, mean, self._gaps(name, i, phase)) for phase in PHASES
             }
             for i, mode in enumerate(MODES)
         }
@@ -204,7 +199,10 @@ class Summary:
             arms = m.true["now"], m.true["later"], m.returns[name]["forecast"]
             yield tuple(arm[mode][part] for arm in arms)
 
-    def _rows(self, horizons: Sequence[int], cells: list[Cell]) -> Rows:
+    def _rows(
+        self, horizons: Sequence[int], statistic: Callable[..., np.ndarray], *samples: np.ndarray
+    ) -> Rows:
+        cells = self._bootstrap.interval(statistic, *samples)
         return tuple(Row(h=h, **cell) for h, cell in zip(horizons, cells, strict=True))
 
 

@@ -38,6 +38,9 @@ Example = dict[str, Tensor]
 NaN where the run ends before."""
 
 
+E = TypeVar("E", bound="StartExamples")
+
+
 @dataclass(frozen=True, kw_only=True)
 class StartExamples(Examples):
     """Base of the examples that are starts of runs."""
@@ -45,8 +48,10 @@ class StartExamples(Examples):
     group: Int[Tensor, " start"]
     """Number of the data set, from 0, rising."""
 
-
-E = TypeVar("E", bound=StartExamples)
+    @classmethod
+    def of(cls: type[E], found: Sequence[Example]) -> E:
+        """Put examples of one start each together."""
+        return cls(**{name: torch.stack([one[name] for one in found]) for name in found[0]})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +80,8 @@ class StartsLearner(Learner[E]):
 
     model: ClassVar[type[SavedNetwork[Any, Any]]]
     """The forecaster that is made of the network."""
+    examples_type: type[E]
+    """What batches are."""
 
     def __init__(self, config: StartsConfig) -> None:
         self.config, self.horizons = config, fitted(config.network.horizons)
@@ -93,10 +100,6 @@ class StartsLearner(Learner[E]):
     @abstractmethod
     def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
         """Return the examples of one run."""
-
-    @abstractmethod
-    def collate(self, found: Sequence[Example]) -> E:
-        """Put examples together, the first axis of every tensor being the start."""
 
     def settings(self) -> dict[str, Any]:
         """Return what train.json says of the training."""
@@ -147,7 +150,7 @@ class StartsLearner(Learner[E]):
         reached = [one["energy"].isfinite() for one in found]
         if not reached or not torch.stack(reached).any(0).all():
             return None
-        return self.collate(found)
+        return self.examples_type.of(found)
 
 
 def train_on_starts(

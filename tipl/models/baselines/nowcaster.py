@@ -130,7 +130,7 @@ class Nowcaster(SavedNetwork[PerParameter, NowcasterConfig]):
         return out
 
 
-class NowcasterFit(Generic[N]):
+class NowcasterFit(Learner[ParameterRows], Generic[N]):
     """A fit that takes one run after the other and keeps some rows of each.
 
     The seed is that of the sample, the first weights and the batches; without ``training`` the loop
@@ -182,41 +182,25 @@ class NowcasterFit(Generic[N]):
         }
 
     def finish(self) -> N:
-        """Train.
+        """Train the network.
 
         Raises:
             TrainError: no run was long enough.
         """
-        examples, validation = (_examples(self._rows[part]) for part in (False, True))
+        examples, self._held_out = (_examples(self._rows[part]) for part in (False, True))
         if examples is None or not examples.target.isfinite().any(0).all():
             raise too_short(self._config.horizons)
-        with TemporaryDirectory() as place:
-            out = Path(place)
-
-            def build(*_: object) -> NowcasterLearner:
-                network = self._kind.build(self._config)
-                standardise(network, examples)
-                model = self._kind(network, self._config, self._kind.name)
-                return NowcasterLearner(model, examples, validation, self._training)
-
-            train_network(build, self._training, out)
+        self._examples = examples
+        with TemporaryDirectory() as out:
+            train_network(self._started, self._training, Path(out))
             return replace(self._kind.load(out), name=self._kind.name)
 
-
-class NowcasterLearner(Learner[ParameterRows]):
-    """A small network, rows of parameters, and their loss."""
-
-    def __init__(
-        self,
-        model: Nowcaster,
-        examples: ParameterRows,
-        validation: ParameterRows | None,
-        training: LoopConfig,
-    ) -> None:
-        self.network = model.network
-        self._model, self._examples, self._held_out = model, examples, validation
-        self._training = training
-        self._roots = torch.tensor(model.config.horizons).float().sqrt()
+    def _started(self, _: object) -> NowcasterFit[N]:
+        """Draw the first weights; the loop has set the seed."""
+        self.network: PerParameter = self._kind.build(self._config)
+        standardise(self.network, self._examples)
+        self._roots = torch.tensor(self._config.horizons).float().sqrt()
+        return self
 
     def batch(self, n: int) -> ParameterRows:
         """Return random rows, with replacement."""
@@ -236,7 +220,7 @@ class NowcasterLearner(Learner[ParameterRows]):
 
     def save(self, out: Path) -> None:
         """Write the model."""
-        self._model.save(out)
+        self._kind(self.network, self._config).save(out)
 
 
 def _examples(rows: list[dict[str, np.ndarray]]) -> ParameterRows | None:

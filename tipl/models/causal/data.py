@@ -40,11 +40,6 @@ class CausalExamples(StartExamples):
     energy: Float[Tensor, "start horizon"]
     """Squared norm of the whole displacement; NaN where the run ends before."""
 
-    @classmethod
-    def of(cls, found: Sequence[Example]) -> CausalExamples:
-        """Put examples of one start each together."""
-        return cls(**{name: torch.stack([one[name] for one in found]) for name in found[0]})
-
 
 def examples_of(
     run: Run, config: CausalConfig, count: int, rng: np.random.Generator

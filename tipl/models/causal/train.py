@@ -47,15 +47,12 @@ class CausalLearner(StartsLearner[CausalExamples]):
     """The network of tipl-causal, its examples and its loss."""
 
     model = Causal
+    examples_type = CausalExamples
     network: CausalGPT
 
     def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
         """Return the examples of one run."""
         return examples_of(run, self.model_config.network, self.config.starts, rng)
-
-    def collate(self, found: Sequence[Example]) -> CausalExamples:
-        """Put examples together."""
-        return CausalExamples.of(found)
 
     def loss(
         self, network: Callable[..., Tensor], batch: CausalExamples

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +24,9 @@ PARAMS = 128
 """Number of parameters in one example, some of each tensor."""
 POOL = 1024
 """Number of parameters of a run, of which each example takes others."""
+
+
+G = TypeVar("G", bound="GateExamples")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +49,13 @@ class GateExamples(StartExamples):
     """Mean squared displacement of the whole policy."""
 
     @classmethod
-    def of(cls, found: Sequence[Example]) -> GateExamples:
-        """Put examples of one start each together."""
+    def of(cls: type[G], found: Sequence[Example]) -> G:
+        """Put examples of one start each together, of policies of any number of tensors."""
         tensors = max(len(one["contexts"]) for one in found)
         for one in found:
             missing = tensors - len(one["contexts"])
             one["contexts"] = torch.nn.functional.pad(one["contexts"], (0, 0, 0, missing))
-        return cls(**{name: torch.stack([one[name] for one in found]) for name in found[0]})
+        return super().of(found)
 
 
 def examples_of(

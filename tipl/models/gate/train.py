@@ -53,15 +53,12 @@ class GateLearner(StartsLearner[GateExamples]):
     """The network of tipl-gate, its examples and its loss."""
 
     model = Gate
+    examples_type = GateExamples
     network: GateNetwork
 
     def examples_of(self, run: wt.Run, rng: np.random.Generator) -> Iterable[Example]:
         """Return the examples of one run."""
         return examples_of(run, self.model_config.network, self.config.starts, rng)
-
-    def collate(self, found: Sequence[Example]) -> GateExamples:
-        """Put examples together."""
-        return GateExamples.of(found)
 
     def loss(
         self, network: Callable[..., Tensor], batch: GateExamples
