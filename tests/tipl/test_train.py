@@ -156,6 +156,17 @@ def test_other_settings_are_not_mixed(config: TrainConfig) -> None:
         train(change(config, rank=9))
 
 
+def test_a_setting_that_is_newer_than_a_training_has_its_default(config: TrainConfig) -> None:
+    train(config)
+    file = config.out / "train.json"
+    settings = json.loads(file.read_text())
+    del settings["ema"]
+    file.write_text(json.dumps(settings))
+    with pytest.raises(TrainError, match=r"expected: {'ema': 0.0}\n  got: {'ema': 0.5}"):
+        train(change(config, ema=0.5))
+    train(config)
+
+
 def test_other_data_are_not_mixed(config: TrainConfig, tmp_path: Path) -> None:
     train(config)
     other = tmp_path / "dataset"
