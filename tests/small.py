@@ -12,7 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from weighttraj.collect import PPOConfig, Recipe, make_ppo
-from weighttraj.collect.recipe import Seeds, Store
+from weighttraj.collect.settings import Seeds, Store
 
 # 4 rollouts of 256 steps, 8 gradient steps each: a second of training, same code as a long one.
 SMALL = PPOConfig(total_timesteps=1024, n_steps=256, n_epochs=2, critic_arch=(8, 8))

@@ -15,7 +15,7 @@ from tests.small import SMALL_RECIPE
 from weighttraj.collect import read_recipe
 from weighttraj.collect.agents import actor_parameters
 from weighttraj.collect.population import Origin, check_config
-from weighttraj.collect.recipe import SPLITS
+from weighttraj.collect.settings import SPLITS
 from weighttraj.learning import learning_phase
 
 ROOT = Path(__file__).parents[1]

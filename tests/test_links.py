@@ -16,7 +16,7 @@ from tests.benchmarks.stress_format import live_copy
 from tests.small import SMALL_RECIPE
 from weighttraj import registry
 from weighttraj.collect import collect
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.errors import WeightTrajError
 from weighttraj.load.cache import CachedWeights
 from weighttraj.policies import ReturnsConfig, fill_returns

@@ -295,20 +295,3 @@ def _is_link(name: str, folder: int) -> bool:
         return stat.S_ISLNK(os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode)
     except FileNotFoundError:
         return False
-
-
-__all__ = [
-    "DRAFT",
-    "appearing",
-    "appending",
-    "drafting",
-    "linked",
-    "links_in",
-    "lock_of",
-    "refuse_existing",
-    "refuse_link",
-    "remove_abandoned",
-    "replace_file",
-    "replacing",
-    "sync",
-]

@@ -51,7 +51,7 @@ class _Collect:
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes)
 def _collect(args: _Collect) -> None:
     """Collect the data set of a recipe, or go on where it stopped."""
-    from weighttraj.collect.recipe import parse_seeds
+    from weighttraj.collect.settings import parse_seeds
     from weighttraj.plugins import import_modules
 
     import_modules(args.imports)  # the recipe may name an environment of theirs
@@ -272,7 +272,7 @@ def _select(
     out: Annotated[Path, tyro.conf.arg(help="folder of the new data set")],
 ) -> None:
     """Make a data set of some runs of another one; it says which part it is of what."""
-    from weighttraj.collect.recipe import parse_seeds
+    from weighttraj.collect.settings import parse_seeds
 
     say(registry.select(path, out, seeds=parse_seeds(seeds), console=console))
 

@@ -180,6 +180,3 @@ def _fits(value: Any, wanted: Any) -> bool:
     if isinstance(wanted, list | tuple | set | frozenset | range):
         return value in wanted or value == wanted
     return bool(value == wanted)
-
-
-__all__ = ["Dataset"]

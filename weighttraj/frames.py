@@ -136,15 +136,3 @@ def _pandas() -> Any:
     except ModuleNotFoundError as error:
         raise missing_extra("pandas", "files") from error
     return pd
-
-
-__all__ = [
-    "HYPERPARAMETER",
-    "MEAN_RETURNS",
-    "run_dataset",
-    "run_row",
-    "runs_frame",
-    "snapshot_columns",
-    "snapshots_frame",
-    "step_sizes",
-]

@@ -34,6 +34,3 @@ def learning_phase(returns: Float[np.ndarray, " time"], share: float = LEARNED) 
     if final <= first:
         return 0
     return int(rows[np.argmax(returns[rows] - first >= share * (final - first))])
-
-
-__all__ = ["LEARNED", "learning_phase"]

@@ -78,6 +78,3 @@ def clone() -> Path | None:
     """``datasets`` of the clone that this package was installed from; None: from no clone."""
     place = Path(__file__).parents[1] / "datasets"
     return place if place.is_dir() else None
-
-
-__all__ = ["COLLECTED", "HOME", "VARIABLE", "clone", "folders", "is_run", "locate"]

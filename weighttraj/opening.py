@@ -191,6 +191,3 @@ def open_hdf5(path: str | Path) -> Dataset:
     entries = [entry for entry in info.runs if entry.id not in missing]
     runs = [Run(path / "runs" / e.id, partial(H5RunStore.open, path, e.id), e) for e in entries]
     return Dataset(path, info, runs)
-
-
-__all__ = ["info_of_one", "open_dataset", "open_hdf5", "open_run"]

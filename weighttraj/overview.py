@@ -98,6 +98,3 @@ def _size(path: Any) -> str:
         return ""
     files = [path] if path.is_file() else [f for f in path.rglob("*") if f.is_file()]
     return f"{sum(file.stat().st_size for file in files) / 1e6:,.1f} MB"
-
-
-__all__ = ["as_html", "as_text"]

@@ -44,6 +44,3 @@ def _registered() -> dict[str, int]:
     import gymnasium
 
     return {name: id(spec) for name, spec in gymnasium.registry.items()}
-
-
-__all__ = ["import_modules"]

@@ -40,6 +40,3 @@ class LoggedProgress(Progress):
         while not self._ended.wait(wait):
             self.console.print(self.get_renderable())
             wait = min(2 * wait, self.LONGEST)
-
-
-__all__ = ["LoggedProgress"]

@@ -451,6 +451,3 @@ def _rows(key: Any, n: int, where: str) -> Any:
         )
     index = np.where(index < 0, index + n, index)
     return int(index) if index.ndim == 0 else index
-
-
-__all__ = ["ArrayStore", "NormStats", "Run", "StoredArray"]

@@ -61,6 +61,3 @@ def while_read() -> Iterator[None]:
                 sys.stdout.flush()
         except BrokenPipeError:  # what is still to be written goes nowhere
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-__all__ = ["Output", "say", "while_read"]

@@ -62,6 +62,3 @@ def _is_shown(character: str) -> bool:
 
 def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode()
-
-
-__all__ = ["markdown", "printable", "shortened", "yaml"]

@@ -83,6 +83,3 @@ def in_threads(
         for thread in threads:
             thread.join(_PATIENCE / len(threads))
     return [results[number] for number in range(len(items))]
-
-
-__all__ = ["in_threads", "one_torch_thread"]

@@ -30,7 +30,7 @@ from tipl.forecaster import Forecaster
 from tipl.models.baselines import Persistence
 from tipl.models.gate import GateTrainConfig, train_gate
 from weighttraj.collect import collect, read_recipe
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.engine import Tell, engine_of
 
 RECIPES = Path(__file__).parents[2] / "datasets"

@@ -31,8 +31,8 @@ from rich.console import Console
 
 import weighttraj as wt
 from weighttraj.collect import Recipe, collect, read_recipe
-from weighttraj.collect.recipe import Collect, Seeds
 from weighttraj.collect.recorder import Recorder
+from weighttraj.collect.settings import Collect, Seeds
 from weighttraj.publish.curves import mean_returns
 
 RECIPE = Path(__file__).parents[2] / "datasets/inverted-pendulum-v4-ppo-v1/recipe.toml"

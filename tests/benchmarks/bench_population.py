@@ -40,9 +40,9 @@ import weighttraj as wt
 from weighttraj.collect import PPOConfig, Recipe, WeightTrajectoryCallback, collect, make_ppo
 from weighttraj.collect.learners import Learners
 from weighttraj.collect.population import Population, origins_of
-from weighttraj.collect.recipe import Collect, Seeds, Store
 from weighttraj.collect.recorder import Recorder
 from weighttraj.collect.rollouts import Environments
+from weighttraj.collect.settings import Collect, Seeds, Store
 from weighttraj.collect.tasks import open_recorder
 from weighttraj.policies.simulators import Physics
 

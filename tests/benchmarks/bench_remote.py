@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import weighttraj as wt
 from tests.remote import servers
-from weighttraj.registry.transfer import AT_ONCE
+from weighttraj.remote.wait import AT_ONCE
 
 RELEASED = Path(__file__).parents[2] / "datasets/inverted-pendulum-v4-ppo-v1/data"
 KEYS = {"aws_access_key_id": "key", "aws_secret_access_key": "secret"}

@@ -43,7 +43,7 @@ import weighttraj as wt
 from tests.small import SMALL_RECIPE
 from weighttraj.atomic import DRAFT
 from weighttraj.collect import collect
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.errors import WeightTrajError
 from weighttraj.format import ParamLayout, RunInfo
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info

@@ -23,8 +23,8 @@ from weighttraj.collect.learners import Rollout
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.population import Population, draw_normal, origins_of
 from weighttraj.collect.ppo import make_vec_env
-from weighttraj.collect.recipe import Collect, Seeds, Store
 from weighttraj.collect.rollouts import Environments
+from weighttraj.collect.settings import Collect, Seeds, Store
 
 EVERYTHING = Store(every=16, critic=True, optimizer_moments=True, probe_observations=4)
 PENDULUM = Recipe(

@@ -24,7 +24,7 @@ from tests.collect.test_runner import assert_same_arrays, committed
 from tests.disk import grow
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe, replay
-from weighttraj.collect.recipe import Collect, Seeds
+from weighttraj.collect.settings import Collect, Seeds
 from weighttraj.errors import CollectError, RecipeError
 from weighttraj.format import DatasetInfo, RunEntry
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info

@@ -24,7 +24,7 @@ import weighttraj as wt
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe
 from weighttraj.collect.costs import read_costs
-from weighttraj.collect.recipe import Seeds, Store, parse_seeds
+from weighttraj.collect.settings import Seeds, Store, parse_seeds
 from weighttraj.collect.tasks import Task, collect_block
 from weighttraj.errors import CollectError, EngineError, RecipeError
 from weighttraj.format import RunEntry

@@ -15,7 +15,7 @@ import weighttraj as wt
 from tests.small import SMALL_RECIPE
 from tests.test_cli import run as shell
 from weighttraj.collect import collect, replay
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.errors import (
     CollectError,
     FormatError,

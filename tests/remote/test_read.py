@@ -18,7 +18,7 @@ from tests.remote import servers
 from tests.remote.conftest import Bucket
 from weighttraj.errors import DamageError, FormatError, RegistryError, RemoteError
 from weighttraj.remote import RemotePath, is_remote
-from weighttraj.remote.store import TIMEOUT
+from weighttraj.remote.wait import TIMEOUT
 
 ROOT = Path(__file__).parents[2]
 RELEASED = ROOT / "datasets/inverted-pendulum-v4-ppo-v1/data"

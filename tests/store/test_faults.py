@@ -35,7 +35,7 @@ from tests.benchmarks.stress_format import (
 from tests.disk import grow
 from weighttraj.collect import collect
 from weighttraj.collect.costs import COSTS
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.errors import CollectError, StoreLockedError
 from weighttraj.load.cache import CachedWeights, CacheError
 

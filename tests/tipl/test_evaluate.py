@@ -42,7 +42,7 @@ from tipl.evaluation.weights import squared_errors
 from tipl.report.verdict import verdict
 from tipl.saved import fingerprint
 from weighttraj.collect import collect
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.format import DatasetInfo, RunEntry
 from weighttraj.policies import ReturnsConfig, fill_returns
 from weighttraj.policies import evaluate as play

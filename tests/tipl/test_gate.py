@@ -39,7 +39,7 @@ from tipl.structure import Clock, Structure
 from tipl.training import loop
 from tipl.training.checkpoint import read_log
 from weighttraj.collect import collect
-from weighttraj.collect.recipe import Seeds
+from weighttraj.collect.settings import Seeds
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 

@@ -235,7 +235,7 @@ def test_a_killed_export_leaves_no_file_under_its_name(tmp_path: Path) -> None:
         for row in weights(100, 100_000):
             writer.append(row, num_timesteps=0)
     out = tmp_path / "out.h5"
-    code = "import sys; from weighttraj.tools.hdf5 import *; export_hdf5(*sys.argv[1:])"
+    code = "import sys; from weighttraj.tools.hdf5 import export_hdf5; export_hdf5(*sys.argv[1:])"
     child = subprocess.Popen(
         [sys.executable, "-c", code, str(tmp_path / "run.zarr"), str(out)], cwd=ROOT
     )

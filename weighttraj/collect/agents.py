@@ -174,6 +174,3 @@ def _optimizers(model: BaseAlgorithm) -> Iterator[tuple[str, torch.optim.Optimiz
                     seen.add(id(optimizer))
                     index = f"[{i}]" if values is value else ""
                     yield f"{prefix}.{name}{index}".replace("..", ".").lstrip("."), optimizer
-
-
-__all__ = ["SUPPORTED", "Agent", "Unit", "actor_parameters", "critic_parameters", "find_agent"]

@@ -57,6 +57,3 @@ def _cpu_seconds() -> float:
     """Return the CPU seconds of this process and of its children that have ended."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
-
-
-__all__ = ["COSTS", "measured", "read_costs"]

@@ -85,6 +85,3 @@ class _Exclusion(_Wrapper):
 
     def __call__(self) -> list[str]:
         return [*self._method(), *self._names]
-
-
-__all__ = ["Guard"]

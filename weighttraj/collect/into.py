@@ -202,6 +202,3 @@ def _copy(run: Run, stored: dict[str, Tensor], tensors: dict[str, Tensor]) -> No
         for name, value in before.items():
             tensors[name].copy_(value)
         raise
-
-
-__all__ = ["load_into"]

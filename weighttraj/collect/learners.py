@@ -224,6 +224,3 @@ def _diagnostics(
     values, returns = rollout.values[learner].numpy(), rollout.returns[learner].numpy()
     figures["explained_variance"] = explained_variance(values, returns)
     return figures
-
-
-__all__ = ["Learners", "Rollout"]

@@ -13,8 +13,7 @@ from gymnasium import spaces
 
 from weighttraj import environments
 from weighttraj.collect.ppo import PPOConfig
-from weighttraj.collect.seeds import SPLITS, Seeds, read_seeds
-from weighttraj.collect.settings import Collect, Store
+from weighttraj.collect.settings import SPLITS, Collect, Seeds, Store, read_seeds
 from weighttraj.errors import FormatError
 from weighttraj.format.schema import check_id
 from weighttraj.policies.kernels import kernel_for
@@ -218,6 +217,3 @@ def _text(value: Any) -> str:
     if isinstance(value, str):
         return value if len(value) <= _MOST_LETTERS else f"{value[:_MOST_LETTERS]}..."
     return str(value) if isinstance(value, float) else reprlib.repr(value)
-
-
-__all__ = ["Problem", "population_problems", "problems_of", "seed_problems"]

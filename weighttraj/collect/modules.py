@@ -90,6 +90,3 @@ def _misfit_of_choices(
     if not isinstance(action_space, spaces.Discrete) or layout[last].size == action_space.n:
         return ""
     return f"there are {action_space.n} actions, and {last} has {layout[last].size} numbers"
-
-
-__all__ = ["describe_mlp"]

@@ -166,6 +166,3 @@ def _layer_gradient(layer: _Layer, inputs: Tensor, gradient: Tensor) -> None:
 
 def _round_up(n: int, unit: int) -> int:
     return -(-n // unit) * unit
-
-
-__all__ = ["MLP", "Stack"]

@@ -142,6 +142,3 @@ def _unvalidated() -> Iterator[None]:
         yield
     finally:
         Distribution._validate_args = before
-
-
-__all__ = ["difference", "operations"]

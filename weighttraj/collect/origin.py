@@ -85,6 +85,3 @@ def _check_normalizer(run: Run, t: int, norm: Normalizers) -> None:
             where=f"{run.path}, snapshot {t}",
             do="load it with the model, as with VecNormalize.load, or leave continues out",
         )
-
-
-__all__ = ["find_origin", "find_source"]

@@ -299,6 +299,3 @@ def _log_probs(actions: np.ndarray, means: np.ndarray, std: np.ndarray) -> np.nd
 def _by_learner(values: np.ndarray) -> Tensor:
     """(step, learner, ...) as a tensor (learner, step, ...)."""
     return torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1)))
-
-
-__all__ = ["Origin", "Population", "check_config", "draw_normal", "origins_of"]

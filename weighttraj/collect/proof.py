@@ -342,6 +342,3 @@ def _line(error: Exception) -> str:
     """The first line of an error."""
     text = error.message if isinstance(error, WeightTrajError) else str(error)
     return f"{type(error).__name__}: {(text.splitlines() or [''])[0]}"[:200]
-
-
-__all__ = ["acts_with", "find_difference", "find_difference_of_network"]

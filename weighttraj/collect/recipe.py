@@ -14,8 +14,7 @@ import msgspec
 
 from weighttraj.collect.limits import Problem, problems_of, seed_problems
 from weighttraj.collect.ppo import PPOConfig
-from weighttraj.collect.seeds import SPLITS, Seeds, parse_seeds
-from weighttraj.collect.settings import Collect, Store
+from weighttraj.collect.settings import Collect, Seeds, Store
 from weighttraj.collect.toml_lines import line_of
 from weighttraj.errors import RecipeError
 
@@ -146,6 +145,3 @@ def _check_keys(table: dict[str, Any], kind: type, path: Path, text: str, prefix
         part: Any = fields[key].default_factory
         if isinstance(value, dict) and part in (PPOConfig, Seeds, Collect, Store):
             _check_keys(value, part, path, text, f"{prefix}{key}.")
-
-
-__all__ = ["SPLITS", "Collect", "Recipe", "Seeds", "Store", "parse_seeds", "read_recipe"]

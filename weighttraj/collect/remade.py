@@ -188,6 +188,3 @@ def _shown(value: Any) -> str:
 
 def _first_lines(error: WeightTrajError) -> str:
     return " ".join(error.message.split())[:200]
-
-
-__all__ = ["compare"]

@@ -17,7 +17,8 @@ from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.describe import describe_provenance
 from weighttraj.collect.population import Population, check_config, origins_of
 from weighttraj.collect.ppo import make_ppo
-from weighttraj.collect.recipe import Recipe, Store, parse_seeds
+from weighttraj.collect.recipe import Recipe
+from weighttraj.collect.settings import Store, parse_seeds
 from weighttraj.collect.tasks import open_recorder
 from weighttraj.errors import CollectError, WeightTrajError
 from weighttraj.opening import open_dataset, open_run

@@ -128,6 +128,3 @@ def check_kernel(env: gym.Env[Any, Any], env_id: str) -> Kernel:
 def _time_limit(env: gym.Env[Any, Any]) -> float:
     limit = env.spec.max_episode_steps if env.spec is not None else None
     return limit or float("inf")
-
-
-__all__ = ["Environments", "check_kernel"]

@@ -16,7 +16,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 
 from weighttraj.atomic import lock_of, refuse_link
 from weighttraj.collect.costs import measured
-from weighttraj.collect.recipe import Recipe, parse_seeds
+from weighttraj.collect.recipe import Recipe
+from weighttraj.collect.settings import parse_seeds
 from weighttraj.collect.tasks import Failure, Report, Task, blocks_of, collect_block
 from weighttraj.dataset import Dataset
 from weighttraj.engine import Engine, engine_of

@@ -226,5 +226,3 @@ NORMALIZERS: dict[str, Callable[[np.ndarray, float], Normalizer]] = {
     "none": NoNormalizer,
 }
 """Normalizers by their name in a recipe."""
-
-__all__ = ["NORMALIZERS", "Normalizer"]

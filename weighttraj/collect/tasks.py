@@ -21,8 +21,9 @@ from weighttraj.collect.describe import describe_algorithm, describe_run
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.population import Origin, Population, origins_of
 from weighttraj.collect.ppo import make_ppo
-from weighttraj.collect.recipe import Recipe, Store
+from weighttraj.collect.recipe import Recipe
 from weighttraj.collect.recorder import Recorder
+from weighttraj.collect.settings import Store
 from weighttraj.errors import CollectError
 from weighttraj.store.zarr_run import read_info
 from weighttraj.threads import one_torch_thread
@@ -260,6 +261,3 @@ def _noted(task: Task, failures: list[Failure]) -> Iterator[None]:
         yield
     except Exception as error:
         failures.append((task, error))
-
-
-__all__ = ["Failure", "Report", "Task", "blocks_of", "collect_block", "open_recorder"]

@@ -45,6 +45,3 @@ def _is_outermost(before: list[str]) -> bool:
     except ValueError:
         return False
     return True
-
-
-__all__ = ["line_of"]

@@ -180,6 +180,3 @@ def _same_spaces(outer: Any, inner: Any) -> bool:
 def _equal(got: Any, given: np.ndarray) -> bool:
     got = np.asarray(got)
     return got.dtype == given.dtype and np.array_equal(got, given)
-
-
-__all__ = ["is_transparent", "is_transparent_vec"]

@@ -59,6 +59,3 @@ def _equal(now: torch.Tensor, last: torch.Tensor) -> bool:
     return same or (
         now.shape == last.shape and torch.allclose(now, last, rtol=0, atol=0, equal_nan=True)
     )
-
-
-__all__ = ["Watch"]

@@ -4,9 +4,8 @@ A task is idempotent: done again after its worker was killed, it goes on from wh
 who does it does not move a bit of the result.
 """
 
-from weighttraj.engine.base import Engine, Outcome, Tell
+from weighttraj.engine.base import Engine, Outcome, Serial, Tell
 from weighttraj.engine.choose import engine_of
 from weighttraj.engine.processes import Processes
-from weighttraj.engine.serial import Serial
 
 __all__ = ["Engine", "Outcome", "Processes", "Serial", "Tell", "engine_of"]

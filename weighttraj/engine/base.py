@@ -1,4 +1,4 @@
-"""What every engine does."""
+"""What every engine does, and the one that does it in this process."""
 
 from __future__ import annotations
 
@@ -55,6 +55,28 @@ class Engine(Protocol):
         ...
 
 
+class Serial:
+    """Does tasks in this process, see ``Engine``."""
+
+    workers = 1
+
+    def run(
+        self,
+        do: Callable[[T, Tell], R],
+        tasks: Sequence[T],
+        note: Tell,
+        *,
+        wait: bool = True,
+    ) -> Iterator[Outcome[T, R]]:
+        """See ``Engine``."""
+        for task in tasks:
+            try:
+                outcome: R | Exception = do(task, note)
+            except Exception as error:
+                outcome = error
+            yield task, outcome
+
+
 @contextlib.contextmanager
 def noted_interrupts() -> Iterator[threading.Event]:
     """Note Ctrl-C instead of raising it anywhere, also when it is pressed again and again.
@@ -70,6 +92,3 @@ def noted_interrupts() -> Iterator[threading.Event]:
         yield noted
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-__all__ = ["RETRIES", "Engine", "Outcome", "R", "T", "Tell", "noted_interrupts"]

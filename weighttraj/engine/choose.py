@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 
-from weighttraj.engine.base import Engine, Outcome, R, T, Tell
+from weighttraj.engine.base import Engine, Outcome, R, Serial, T, Tell
 from weighttraj.engine.processes import Processes
-from weighttraj.engine.serial import Serial
 from weighttraj.errors import EngineError
 from weighttraj.plugins import import_modules
 
@@ -62,6 +61,3 @@ class _Importing:
 def _import_and_do(imports: tuple[str, ...], do: Callable[[T, Tell], R], task: T, tell: Tell) -> R:
     import_modules(imports)
     return do(task, tell)
-
-
-__all__ = ["engine_of"]

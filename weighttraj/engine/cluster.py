@@ -176,6 +176,3 @@ class _Deaf(distributed.WorkerPlugin):
     def setup(self, worker: Any) -> None:
         """Called in each worker when it begins."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-__all__ = ["LOCAL", "Cluster"]

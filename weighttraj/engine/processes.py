@@ -180,6 +180,3 @@ def _tell(*message: Any) -> None:
     _telling.send(message)
     if _order.value != _GO:
         raise KeyboardInterrupt
-
-
-__all__ = ["Processes"]

@@ -109,6 +109,3 @@ def _not_json(value: Any, where: str) -> FormatError:
         where=where,
         do="describe the value by plain data",
     )
-
-
-__all__ = ["decode", "encode", "encode_exactly"]

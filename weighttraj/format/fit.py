@@ -65,6 +65,3 @@ def _misfit_of_actions(
     }
     wrong = [f"{name} has {count}" for name, count in counts.items() if count != size]
     return f"an action has {size} numbers, and {wrong[0]}" if wrong else ""
-
-
-__all__ = ["find_misfit"]

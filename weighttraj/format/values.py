@@ -67,6 +67,3 @@ def _error(what: str, source: np.ndarray, where: str) -> SnapshotError:
         where=where,
         do="convert the value before it is handed over",
     )
-
-
-__all__ = ["as_array"]

@@ -94,6 +94,3 @@ def _by_snapshot(run: Run, name: str) -> bool:
 
 def _known(run: Run) -> list[str]:
     return [name for name in run.keys() if run[name].dims[0] == "time"]  # noqa: SIM118
-
-
-__all__ = ["expand", "mean_returns", "values"]

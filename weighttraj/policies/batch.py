@@ -169,6 +169,3 @@ def load_policies(
         source = np.full(len(weights), len(run) - 1) if final_normalizer else chosen
         mean, var = run["obs_norm/mean"][source], run["obs_norm/var"][source]
     return PolicyBatch(run.info.policy, run.layout, weights, run.info.obs_norm, mean, var)
-
-
-__all__ = ["PolicyBatch", "load_policies"]

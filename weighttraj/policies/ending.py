@@ -62,6 +62,3 @@ def check_numbers(*, max_steps: int | None = None, **counts: int) -> None:
             got=", ".join(f"{name} {number}" for name, number in given.items()),
             do="give larger numbers",
         )
-
-
-__all__ = ["ENDLESS", "End", "check_numbers", "end_of"]

@@ -220,6 +220,3 @@ def _normalises(env: Env) -> bool:
             return True
         env = env.env
     return False
-
-
-__all__ = ["evaluate"]

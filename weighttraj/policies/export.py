@@ -280,6 +280,3 @@ def _adam(hyper: dict[str, Any]) -> dict[str, Any]:
         return {}
     names = ("betas", "eps", "weight_decay")
     return {name: optimizer[name] for name in names if name in optimizer}
-
-
-__all__ = ["SB3Export", "export_sb3"]

@@ -259,6 +259,3 @@ def _square(x: np.ndarray) -> np.ndarray:
 def _norm(vectors: np.ndarray) -> np.ndarray:
     """Euclidean norms, rounded as ``np.linalg.norm`` rounds that of a single vector."""
     return np.asarray(np.sqrt(np.matmul(vectors[:, None, :], vectors[:, :, None])[:, 0, 0]))
-
-
-__all__ = ["Kernel", "State", "kernel_for"]

@@ -528,6 +528,3 @@ def _only_one(path: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-__all__ = ["ReturnsConfig", "fill_returns", "play_rows"]

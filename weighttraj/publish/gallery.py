@@ -292,6 +292,3 @@ if (location.hash.startsWith("#q=")) field.value = decodeURIComponent(location.h
 document.getElementById("finder").hidden = false;
 search();
 """
-
-
-__all__ = ["INDEX", "Entry", "as_html", "gallery", "page_name"]

@@ -313,6 +313,3 @@ def _film(run: Run, seed: int, progress: Progress, task: Any) -> tuple[dict[str,
         "width": made.size[0],
         "height": made.size[1],
     }, ""
-
-
-__all__ = ["MARK", "report", "shown"]

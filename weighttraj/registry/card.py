@@ -332,6 +332,3 @@ def _is_schedule(value: Any) -> bool:
         and all(isinstance(pair, list) and len(pair) == 2 for pair in value)
         and all(isinstance(number, int | float) for pair in value for number in pair)
     )
-
-
-__all__ = ["CARD", "SECTIONS", "new_card", "refreshed", "write_card"]

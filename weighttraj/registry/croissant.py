@@ -148,6 +148,3 @@ def _kind(arrow: str) -> str:
     if arrow.startswith(("int", "uint")):
         return "sc:Integer"
     return "sc:Float" if arrow.startswith(("float", "double", "half")) else "sc:Text"
-
-
-__all__ = ["CROISSANT", "citation", "croissant"]

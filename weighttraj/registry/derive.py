@@ -286,6 +286,3 @@ def _copy(run: Run, target: Path, run_id: str) -> None:
         copy_packed(packed, target, run_id)
     elif packed != target:
         shutil.copyfile(packed, target)
-
-
-__all__ = ["SPLITS", "combine", "create", "select", "split"]

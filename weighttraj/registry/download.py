@@ -32,9 +32,10 @@ from weighttraj.format import RunEntry
 from weighttraj.locate import VARIABLE, folders
 from weighttraj.opening import open_dataset
 from weighttraj.progress import LoggedProgress
-from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
-from weighttraj.remote.store import BrokenOffError, NoPartsError, RemoteStore, store_at
+from weighttraj.remote.failures import BrokenOffError, NoPartsError
+from weighttraj.remote.store import RemoteStore, store_at
+from weighttraj.remote.wait import for_each
 from weighttraj.store.catalog import (
     DATASET,
     MANIFEST,
@@ -463,6 +464,3 @@ def _progress(console: Console, total: int) -> Iterator[tuple[Progress, TaskID]]
 def _sha256(file: Path) -> Any:
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256")
-
-
-__all__ = ["SOURCE", "Source", "download", "download_folder", "home", "name_of", "source_of"]

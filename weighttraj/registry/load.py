@@ -91,6 +91,3 @@ def _downloaded(place: RemotePath, revision: str | None, runs: Collection[str] |
     if runs is None or {run.id for run in dataset} >= set(runs):
         return open_dataset(path, runs=runs)
     raise FileNotFoundError(path)
-
-
-__all__ = ["REMOTE", "load_dataset"]

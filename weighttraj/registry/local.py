@@ -136,6 +136,3 @@ def _data(place: Path) -> Path | None:
         if (path / DATASET).is_file():
             return path
     return None
-
-
-__all__ = ["LocalDataset", "delete", "local_datasets"]

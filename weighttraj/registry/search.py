@@ -87,6 +87,3 @@ def _table(dataset: LocalDataset) -> pd.DataFrame:
     known = [c for c in table.column_names if c in RUN_COLUMNS or c.startswith(HYPERPARAMETER)]
     frame: pd.DataFrame = table.select(known).to_pandas(ignore_metadata=True)
     return frame
-
-
-__all__ = ["search"]

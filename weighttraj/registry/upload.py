@@ -16,10 +16,10 @@ from weighttraj.errors import RegistryError
 from weighttraj.locate import is_run, locate
 from weighttraj.opening import open_dataset
 from weighttraj.progress import LoggedProgress
-from weighttraj.registry.transfer import for_each
 from weighttraj.remote.address import RemotePath
 from weighttraj.remote.hub import client, hub_error, pinned
 from weighttraj.remote.store import MAX_DOCUMENT, RemoteStore, store_at
+from weighttraj.remote.wait import for_each
 from weighttraj.store.catalog import DATASET, MANIFEST, ManifestLine, read_manifest
 from weighttraj.store.objects import read_plain
 from weighttraj.tools.lint import lint
@@ -288,6 +288,3 @@ def _immutable(place: RemotePath) -> RegistryError:
         where=place,
         do="publish it under another version, or address",
     )
-
-
-__all__ = ["CLAIM", "repository_of", "upload", "upload_folder"]

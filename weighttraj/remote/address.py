@@ -337,17 +337,3 @@ def _wrong(address: str, got: str, do: str) -> RegistryError:
         got=f"{address!r}: {got}",
         do=do,
     )
-
-
-__all__ = [
-    "BUCKETS",
-    "SCHEMES",
-    "WEB",
-    "Place",
-    "RemotePath",
-    "Root",
-    "below",
-    "here",
-    "is_remote",
-    "new_path",
-]

@@ -146,15 +146,3 @@ def _explained(error: Exception, scheme: str, text: str, details: str) -> tuple[
     proxy = ", by the proxy that is set" if any(v in os.environ for v in _PROXIES) else ""
     do = f"see whether the server can be reached{proxy}, and try again; {TIMEOUT} says how long"
     return "a remote object cannot be reached", do
-
-
-__all__ = [
-    "BrokenOffError",
-    "NoPartsError",
-    "RefusedError",
-    "failure",
-    "is_final",
-    "no_bucket",
-    "too_large",
-    "unusable",
-]

@@ -78,6 +78,3 @@ def hub_error(error: Exception, where: object) -> RemoteError:
         where=where,
         do=do,
     )
-
-
-__all__ = ["client", "headers", "hub_error", "pinned", "resolve_url"]

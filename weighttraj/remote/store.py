@@ -28,7 +28,7 @@ from weighttraj.remote.failures import (
     too_large,
     unusable,
 )
-from weighttraj.remote.wait import TIMEOUT, patience, result, too_slow
+from weighttraj.remote.wait import patience, result, too_slow
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -332,15 +332,3 @@ def _server(root: Root) -> ObjectStore:
         url, options["default_headers"] = resolve_url(root), headers()
         options["allow_http"] = True  # HF_ENDPOINT is the user's choice
     return HTTPStore.from_url(url, client_options=options, retry_config=retries)
-
-
-__all__ = [
-    "MAX_DOCUMENT",
-    "MAX_OBJECT",
-    "TIMEOUT",
-    "BrokenOffError",
-    "NoPartsError",
-    "Piece",
-    "RemoteStore",
-    "store_at",
-]

@@ -11,8 +11,8 @@ import contextlib
 import functools
 import os
 import threading
-from collections.abc import Callable, Coroutine
-from concurrent.futures import CancelledError, Future
+from collections.abc import Callable, Coroutine, Iterable
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from weighttraj.errors import RemoteError
@@ -26,6 +26,9 @@ _POLL = 0.2  # seconds
 _local = threading.local()
 _process: list[int] = []
 T = TypeVar("T")
+
+AT_ONCE = 4
+"""Files that are sent or fetched at the same time."""
 
 
 def patience() -> float:
@@ -51,7 +54,7 @@ def result(work: Coroutine[Any, Any, T]) -> T:
     """Run a coroutine on the loop of requests, and return its result.
 
     Raises:
-        RemoteError: this is a forked process, or ``stop_with`` said that the thread is to stop.
+        RemoteError: this is a forked process, or another request of ``for_each`` failed.
     """
     try:
         _refuse_fork()
@@ -84,7 +87,24 @@ def within(do: Callable[[], T], where: object) -> T:
         raise too_slow(seconds, where) from None
 
 
-def stop_with(event: threading.Event) -> None:
+def for_each(items: Iterable[T], do: Callable[[T], None]) -> None:
+    """Do something for each item, several at a time.
+
+    The first error, or Ctrl-C, soon ends the requests of those that have begun.
+    """
+    stop = threading.Event()
+    with ThreadPoolExecutor(AT_ONCE, initializer=_stop_with, initargs=(stop,)) as pool:
+        futures = [pool.submit(do, item) for item in items]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _stop_with(event: threading.Event) -> None:
     """Make the requests of the current thread end soon after the event is set."""
     _local.stop = event
 
@@ -136,6 +156,3 @@ def _refuse_fork() -> None:
             got=f"process {os.getpid()}",
             do="start processes with multiprocessing_context='spawn', or download the data set",
         )
-
-
-__all__ = ["TIMEOUT", "patience", "result", "stop_with", "too_slow", "within"]

@@ -328,6 +328,3 @@ def _located(root: h5py.File, name: str) -> Any:
             )
         found = h5py.h5o.open(found, part.encode())
     return found
-
-
-__all__ = ["Blocks", "H5RunStore", "exists", "opened", "read_document", "sha256"]

@@ -8,7 +8,8 @@ from typing import Any
 
 from weighttraj.errors import DamageError
 from weighttraj.remote.address import RemotePath
-from weighttraj.remote.store import MAX_OBJECT, NoPartsError, Piece, store_at
+from weighttraj.remote.failures import NoPartsError
+from weighttraj.remote.store import MAX_OBJECT, Piece, store_at
 from weighttraj.store.objects import ZipObjects, check_name, replaced
 
 TAIL_BYTES = 1 << 16
@@ -136,6 +137,3 @@ class RemoteFolder:
 
     def _name(self, name: str) -> str:
         return (self.path / check_name(name, self.path)).part
-
-
-__all__ = ["RemoteBlob", "RemoteFolder", "remote_objects"]

@@ -119,6 +119,3 @@ def _write_csv(file: Path, header: Iterable[str], lines: Iterable[Iterable[Any]]
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(lines)
-
-
-__all__ = ["export_npy", "export_safetensors"]

@@ -185,6 +185,3 @@ def _import_run(run: Run, path: Path) -> None:
     if folder != path:
         pack(folder, profile=info.profile, out=path)
         shutil.rmtree(folder)
-
-
-__all__ = ["export_hdf5", "import_hdf5"]

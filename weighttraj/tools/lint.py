@@ -255,6 +255,3 @@ def _between(runs: Sequence[Run]) -> Iterator[Finding]:
 def _some(values: Sequence[object]) -> str:
     shown = ", ".join(map(str, values[:5]))
     return shown if len(values) <= 5 else f"{shown} and {len(values) - 5} more"
-
-
-__all__ = ["Finding", "lint", "lint_returns", "lint_run"]

@@ -216,6 +216,3 @@ def _equal(one: Path, other: Path) -> bool:
             if piece != b.read(len(piece)):
                 return False
     return True
-
-
-__all__ = ["GROUPS", "copy_packed", "cut", "pack", "same_as_packed", "unpacked"]

@@ -215,6 +215,3 @@ _DRAFT = re.compile(r"\..+\.\d+\.draft")
 
 
 _DROPPED = "damaged returns dropped; weighttraj returns evaluates the snapshots again"
-
-
-__all__ = ["repair", "seal", "unseal"]

@@ -264,6 +264,3 @@ def _compare(
 
 def _bytes(store: RunStore, name: str) -> bytes:
     return store.read(name, slice(None)).tobytes()
-
-
-__all__ = ["drop_returns", "locked_path", "store_returns"]

@@ -190,6 +190,3 @@ def object_names(store: RunStore) -> Iterator[str]:
     for file in folder.rglob("*"):
         if file.is_symlink() or not file.is_dir():
             yield file.relative_to(folder).as_posix()
-
-
-__all__ = ["check_manifest_quietly", "is_chunk", "object_names", "problems_of_run", "verify"]
