@@ -64,15 +64,12 @@ def __dir__() -> list[str]:
 
 def _check_extra() -> None:
     """Refuse to be imported without the extra ``tipl``; nothing of it is imported here."""
-    for part in ("torch", "jinja2", "matplotlib", "safetensors", "threadpoolctl"):
-        try:
-            found = find_spec(part) is not None
-        except ModuleNotFoundError:
-            found = False
-        if not found:
-            from weighttraj.errors import missing_extra
+    from weighttraj.errors import needs
 
-            raise missing_extra(part, "tipl")
+    for part in ("torch", "jinja2", "matplotlib", "safetensors", "threadpoolctl"):
+        with needs("tipl"):
+            if find_spec(part) is None:
+                raise ModuleNotFoundError(name=part)
 
 
 _check_extra()

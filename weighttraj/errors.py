@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 from weighttraj.text import printable, shortened
 
 _LONGEST = 4000
@@ -120,10 +123,18 @@ class MissingExtraError(WeightTrajError, ImportError):
     """An optional dependency is not installed."""
 
 
-def missing_extra(module: str, extra: str) -> MissingExtraError:
-    """The error for an optional dependency that is not installed, with the command that helps."""
-    return MissingExtraError(
-        f"this part of the package needs {module}, which is not installed",
-        where=f"optional dependencies [{extra}]",
-        do=f"pip install 'weighttraj[{extra}]'",
-    )
+@contextlib.contextmanager
+def needs(extra: str) -> Iterator[None]:
+    """Import optional dependencies inside; where one is not installed, say what installs it.
+
+    Raises:
+        MissingExtraError: a module is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"this part of the package needs {error.name}, which is not installed",
+            where=f"optional dependencies [{extra}]",
+            do=f"pip install 'weighttraj[{extra}]'",
+        ) from error

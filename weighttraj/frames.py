@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from weighttraj.errors import missing_extra
+from weighttraj.errors import needs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,10 +103,8 @@ def run_dataset(run: Run) -> xr.Dataset:
     Variables have the names of ``run.keys()``. Snapshots have the coordinate ``num_timesteps``,
     parameters the coordinate ``tensor``, the name of the tensor that each belongs to.
     """
-    try:
+    with needs("files"):
         import xarray as xr
-    except ModuleNotFoundError as error:
-        raise missing_extra("xarray", "files") from error
     tensors = np.concatenate([np.full(p.size, p.name) for p in run.layout.params])
     return xr.Dataset(
         {name: (array.dims, _lazy(array)) for name, array in run.arrays.items()},
@@ -131,8 +129,6 @@ def _lazy(array: StoredArray) -> Any:
 
 
 def _pandas() -> Any:
-    try:
+    with needs("files"):
         import pandas as pd
-    except ModuleNotFoundError as error:
-        raise missing_extra("pandas", "files") from error
     return pd

@@ -1,11 +1,9 @@
 """From a training run to a stored trajectory. Needs the extra ``sb3``."""
 
-from weighttraj.errors import missing_extra
+from weighttraj.errors import needs
 
-try:
+with needs("sb3"):
     import stable_baselines3 as _sb3
-except ModuleNotFoundError as error:
-    raise missing_extra(str(error.name), "sb3") from error
 
 from weighttraj.collect.callback import WeightTrajectoryCallback
 from weighttraj.collect.modules import describe_mlp

@@ -11,12 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from weighttraj.engine.base import RETRIES, Outcome, R, T, Tell, noted_interrupts
-from weighttraj.errors import EngineError, missing_extra
+from weighttraj.errors import EngineError, needs
 
-try:
+with needs("dask"):
     import distributed
-except ModuleNotFoundError as error:
-    raise missing_extra(str(error.name), "dask") from error
 
 LOCAL = "local"
 """Instead of an address: a cluster on this machine, for as long as it has work."""

@@ -1,11 +1,9 @@
 """Stored trajectories as PyTorch data sets. Needs torch, which comes with the extra ``sb3``."""
 
-from weighttraj.errors import CacheError, LoaderError, missing_extra
+from weighttraj.errors import CacheError, LoaderError, needs
 
-try:
+with needs("sb3"):
     import torch as _torch
-except ModuleNotFoundError as error:
-    raise missing_extra(str(error.name), "sb3") from error
 
 from weighttraj.load.cache import CachedWeights, cache_folder, cache_size, clear_cache
 from weighttraj.load.loader import LoaderState, ResumableLoader

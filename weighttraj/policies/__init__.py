@@ -1,14 +1,12 @@
 """Stored snapshots as policies that act, and their returns. Needs the extra ``sb3``."""
 
-from weighttraj.errors import missing_extra
+from weighttraj.errors import needs
 
-try:
+with needs("sb3"):
     import gymnasium as _gymnasium
     import mujoco as _mujoco
     import stable_baselines3 as _stable_baselines3
     import torch as _torch
-except ModuleNotFoundError as error:
-    raise missing_extra(str(error.name), "sb3") from error
 
 from weighttraj.policies.batch import PolicyBatch, load_policies
 from weighttraj.policies.evaluation import evaluate

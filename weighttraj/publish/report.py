@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from weighttraj.atomic import refuse_existing, replace_file
-from weighttraj.errors import StoreExistsError, WeightTrajError, missing_extra
+from weighttraj.errors import StoreExistsError, WeightTrajError, needs
 from weighttraj.progress import LoggedProgress
 from weighttraj.publish import figures
 from weighttraj.publish.curves import (
@@ -281,13 +281,11 @@ def _typical(runs: Sequence[Run]) -> int:
 def _film(run: Run, seed: int, progress: Progress, task: Any) -> tuple[dict[str, Any] | None, str]:
     """What the template shows of the film, or why there is none."""
     try:
-        from weighttraj.publish.film import film
-
+        with needs("sb3"):
+            from weighttraj.publish.film import film
         made = film(run, seed=seed, advance=lambda: progress.advance(task))
-    except (WeightTrajError, ModuleNotFoundError) as error:
+    except WeightTrajError as error:
         progress.update(task, completed=_FILM_STAGES)
-        if isinstance(error, ModuleNotFoundError):
-            error = missing_extra(str(error.name), "sb3")
         return None, str(error)
     rows = [
         {

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
-from weighttraj.errors import RegistryError, WeightTrajError, missing_extra
+from weighttraj.errors import RegistryError, WeightTrajError, needs
 from weighttraj.frames import HYPERPARAMETER
 from weighttraj.opening import open_dataset
 from weighttraj.registry.local import LocalDataset, local_datasets
@@ -41,11 +41,9 @@ def search(
         RegistryError: the query cannot be understood, or names what no run has.
         MissingExtraError: pandas or pyarrow is not installed.
     """
-    try:
+    with needs("files"):
         import pandas as pd
         import pyarrow  # noqa: F401  pandas needs it for the tables
-    except ModuleNotFoundError as error:
-        raise missing_extra(str(error.name), "sb3") from error
     tables = []
     for dataset in local_datasets() if datasets is None else datasets:
         try:

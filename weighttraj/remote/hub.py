@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 from urllib.parse import quote
 
-from weighttraj.errors import RemoteError, missing_extra
+from weighttraj.errors import RemoteError, needs
 from weighttraj.remote.address import RemotePath, Root
 from weighttraj.remote.wait import within
 
@@ -16,12 +16,10 @@ def client() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
+    with needs("hub"):
         import huggingface_hub
         import huggingface_hub.constants
         import huggingface_hub.errors  # it loads its modules when they are named
-    except ModuleNotFoundError as error:
-        raise missing_extra("huggingface_hub", "hub") from error
     return huggingface_hub
 
 

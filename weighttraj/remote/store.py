@@ -16,7 +16,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from weighttraj.errors import RemoteError, missing_extra
+from weighttraj.errors import RemoteError, needs
 from weighttraj.remote.address import BUCKETS, Root
 from weighttraj.remote.failures import (
     BrokenOffError,
@@ -285,10 +285,8 @@ def store_at(root: Root) -> RemoteStore:
 
 
 def _client(root: Root) -> ObjectStore:
-    try:
+    with needs("remote"):
         from obstore.store import LocalStore
-    except ModuleNotFoundError as error:
-        raise missing_extra("obstore", "remote") from error
     folder = Path(root.path or "/")
     if root.scheme == "file" and not folder.is_dir():
         hint = "; in file:// addresses %20 is a space, and %25 a %" if "%" in str(root) else ""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from weighttraj.atomic import appearing
-from weighttraj.errors import missing_extra
+from weighttraj.errors import needs
 from weighttraj.format.schema import to_json
 from weighttraj.run import Run, StoredArray
 
@@ -71,10 +71,8 @@ def export_safetensors(run: Run, t: int, path: str | Path) -> Path:
         IndexError: there is no such snapshot.
         MissingExtraError: safetensors is not installed.
     """
-    try:
+    with needs("files"):
         from safetensors.numpy import save
-    except ModuleNotFoundError as error:
-        raise missing_extra("safetensors", "files") from error
     path, info = Path(path), run.info
     tensors = dict(run.layout.unflatten(run.weights[t]))
     for group, stats in (("obs_norm", run.obs_norm(t)), ("ret_norm", run.ret_norm(t))):

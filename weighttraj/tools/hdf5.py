@@ -17,12 +17,10 @@ from typing import Any
 import numpy as np
 
 from weighttraj.atomic import appearing
-from weighttraj.errors import FormatError, missing_extra
+from weighttraj.errors import FormatError, needs
 
-try:
+with needs("files"):
     import h5py
-except ModuleNotFoundError as error:
-    raise missing_extra("h5py", "files") from error
 
 from weighttraj.dataset import Dataset
 from weighttraj.format.schema import ArraySpec, DatasetInfo, arrays_of, to_json, with_progress

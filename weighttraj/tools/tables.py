@@ -12,7 +12,7 @@ import numpy as np
 
 from weighttraj.atomic import replacing
 from weighttraj.dataset import Dataset
-from weighttraj.errors import DamageError, FormatError, MissingExtraError, missing_extra
+from weighttraj.errors import DamageError, FormatError, MissingExtraError, needs
 from weighttraj.frames import MEAN_RETURNS, run_row, snapshot_columns, step_sizes
 from weighttraj.store.objects import FolderObjects
 from weighttraj.text import printable, shortened
@@ -121,10 +121,8 @@ def _is_exact(value: int | float) -> bool:
 
 
 def _pyarrow() -> Any:
-    try:
+    with needs("files"):
         import pyarrow
-    except ModuleNotFoundError as error:
-        raise missing_extra("pyarrow", "files") from error
     return pyarrow
 
 
