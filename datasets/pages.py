@@ -31,6 +31,7 @@ from weighttraj.collect.costs import read_costs
 from weighttraj.collect.population import Origin
 from weighttraj.publish.curves import KINDS, Kind, band, curves, mean_returns
 from weighttraj.registry.croissant import citation
+from weighttraj.text import between
 
 DATASETS = Path(__file__).parent
 COLLECTED = DATASETS.parent / "data"
@@ -455,9 +456,7 @@ def table() -> str:
 
 def insert(page: str) -> str:
     """Return the page of all data sets with the table as it is now."""
-    before, rest = page.split(START)
-    _, after = rest.split(END)
-    return f"{before}{START}\n\n{table()}\n\n{END}{after}"
+    return between(page, START, END, table())
 
 
 def parameters_of(recipe: Recipe) -> int:

@@ -40,6 +40,7 @@ from torch import nn
 import weighttraj as wt
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.errors import WeightTrajError
+from weighttraj.text import between
 
 FILE = Path(__file__).with_suffix(".json")
 PAGE = Path(__file__).with_suffix(".md")
@@ -309,8 +310,7 @@ def render(results: dict[str, Any]) -> str:
 
 def insert(page: str, results: dict[str, Any]) -> str:
     """The page with the tables of these results."""
-    before, _, rest = page.partition(START)
-    return f"{before}{START}\n\n{render(results)}\n\n{END}{rest.partition(END)[2]}"
+    return between(page, START, END, render(results))
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,8 @@ MEAN_RETURNS = ("mean_return_deterministic", "mean_return_sampled")
 
 _ROWS = 64
 """Snapshots that are in memory at a time."""
+_COLUMNS = 8192
+"""Parameters that are in memory as float64 at a time."""
 
 
 def runs_frame(runs: Sequence[Run]) -> pd.DataFrame:
@@ -88,6 +91,17 @@ def step_sizes(run: Run) -> dict[str, np.ndarray]:
         steps.append(np.linalg.norm(np.diff(rows, axis=0, prepend=before), axis=1))
         last = rows[-1:]
     return {"weight_norm": np.concatenate(norms), "step_norm": np.concatenate(steps)}
+
+
+def distance(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the L2 distance of two snapshots in float64; NaN if one of them is not finite."""
+    total = 0.0
+    for start in range(0, len(one), _COLUMNS):
+        part = slice(start, start + _COLUMNS)
+        with np.errstate(invalid="ignore"):
+            difference = one[part].astype(np.float64) - other[part]
+        total += float(difference @ difference)
+    return math.sqrt(total) if math.isfinite(total) else math.nan
 
 
 def _mean_returns(run: Run, *, deterministic: bool) -> np.ndarray:

@@ -56,6 +56,20 @@ def yaml(text: object) -> str:
     return plain if _PLAIN.fullmatch(plain) else json.dumps(plain, ensure_ascii=False)
 
 
+def between(page: str, start: str, end: str, content: str) -> str:
+    r"""Return a page of Markdown with what stands between two marks replaced.
+
+    >>> between("a <!-- x --> old <!-- end --> b", "<!-- x -->", "<!-- end -->", "new")
+    'a <!-- x -->\n\nnew\n\n<!-- end --> b'
+
+    Raises:
+        ValueError: the page does not have each mark once.
+    """
+    before, rest = page.split(start)
+    _, after = rest.split(end)
+    return f"{before}{start}\n\n{content}\n\n{end}{after}"
+
+
 def _is_shown(character: str) -> bool:
     return character.isprintable() or unicodedata.category(character) == "Zs"
 

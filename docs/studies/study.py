@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from weighttraj.text import between
+
 
 class Study:
     """What was measured and the page that tells it, beside the script and named as it is.
@@ -34,9 +36,7 @@ class Study:
     def insert(self, page: str) -> str:
         """The page with the table as the result file has it, between the script's two lines."""
         start, end = f"<!-- table: written by {self.script.name} -->", "<!-- end of the table -->"
-        before, rest = page.split(start)
-        _, after = rest.split(end)
-        return f"{before}{start}\n\n{self._table(self.measured())}\n\n{end}{after}"
+        return between(page, start, end, self._table(self.measured()))
 
     def render(self) -> None:
         """Write the page."""

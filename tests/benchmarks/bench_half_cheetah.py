@@ -26,6 +26,7 @@ from rich.console import Console
 
 import weighttraj as wt
 from weighttraj.collect import collect, read_recipe
+from weighttraj.text import between
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "datasets/half-cheetah-v4-ppo-v1"
@@ -109,9 +110,7 @@ def render(figures: dict[str, Any]) -> str:
 
 def insert(page: str, figures: dict[str, Any]) -> str:
     """The page with these figures."""
-    before, rest = page.split(START)
-    _, after = rest.split(END)
-    return f"{before}{START}\n\n{render(figures)}\n\n{END}{after}"
+    return between(page, START, END, render(figures))
 
 
 def main() -> None:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from weighttraj.text import between
+
 FILE = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).parents[2] / "docs/benchmarks.md"
 START = "<!-- measured by tests/benchmarks: rewrite with `python tests/benchmarks/results.py` -->"
@@ -280,9 +282,7 @@ def _load(load: dict[str, Any]) -> str:
 
 def insert(page: str) -> str:
     """The page with the table as the results have it."""
-    before, rest = page.split(START)
-    _, after = rest.split(END)
-    return f"{before}{START}\n\n{render(json.loads(FILE.read_text()))}\n\n{END}{after}"
+    return between(page, START, END, render(json.loads(FILE.read_text())))
 
 
 if __name__ == "__main__":

@@ -171,10 +171,9 @@ def fill_returns(
     home = owner or path.parent
     with engine_of(workers, scheduler, imports) as engine, _only_one((owner or path).resolve()):
         runs = _finished(open_dataset(path), console)
-        works = [_Work(run, home, config, replace=replace) for run in runs]
-        todo = [work for work in works if work.missing or work.unsaved]
-        _say_broken(works, console)
-        works = todo
+        every = [_Work(run, home, config, replace=replace) for run in runs]
+        works = [work for work in every if work.missing or work.unsaved]
+        _say_broken(every, console)
         if works and owner:
             unseal(owner)
         _play(works, engine, console)
@@ -355,14 +354,14 @@ class _Journal:
 
     def begin(self) -> None:
         """Write it anew with the lines that hold."""
-        replace_file(self._path, _line(self._header).encode(), root=self._root)
+        replace_file(self._path, _line(self._header), root=self._root)
         self.append(self.rows)
 
     def _read(self) -> _Played:
         if not self._path.is_file():
             return {}
         rows: _Played = {}
-        first = _line(self._header).encode()
+        first = _line(self._header)
         with self._path.open("rb") as file:
             if file.readline(len(first)) != first:
                 return {}
@@ -386,7 +385,7 @@ class _Journal:
             for row, (returns, lengths) in rows.items():
                 numbers = [None if np.isnan(x) else float(x) for x in returns]
                 entry = {"t": row, "returns": numbers, "lengths": lengths.tolist()}
-                file.write(_line(entry).encode())
+                file.write(_line(entry))
 
     def remove(self) -> None:
         """Remove it, and the folder if no other journal is in it."""
@@ -417,12 +416,9 @@ def _entry(line: bytes) -> _Entry | None:
         return None
 
 
-def _line(entry: dict[str, Any]) -> str:
-    return _crc(json.dumps(entry))
-
-
-def _crc(text: str) -> str:
-    return f"{zlib.crc32(text.encode()):08x} {text}\n"
+def _line(entry: dict[str, Any]) -> bytes:
+    text = json.dumps(entry).encode()
+    return b"%08x %s\n" % (zlib.crc32(text), text)
 
 
 def _finished(dataset: Dataset, console: Console) -> list[Run]:

@@ -6,8 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from threading import Event
-from types import TracebackType
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -92,14 +91,6 @@ class Evaluator:
         """What steps the environment: ``mujoco.batch`` or ``gymnasium``."""
         return self._simulators[0].name
 
-    @overload
-    def __call__(
-        self, policy: Policy, *, deterministic: bool = True, tick: Tick = ...
-    ) -> EpisodeReturns: ...
-    @overload
-    def __call__(
-        self, policy: PolicyBatch, *, deterministic: bool = True, tick: Tick = ...
-    ) -> EpisodeReturns: ...
     def __call__(
         self,
         policy: Policy | PolicyBatch,
@@ -148,12 +139,7 @@ class Evaluator:
     def __enter__(self) -> Evaluator:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @cached_property

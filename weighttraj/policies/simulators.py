@@ -59,20 +59,17 @@ class Simulator(Protocol):
         """Close the environments."""
 
 
-def make_simulator(
-    make: Callable[[], gym.Env[Any, Any]], seeds: Sequence[int], *, threads: int = 1
-) -> Simulator:
+def make_simulator(make: Callable[[], gym.Env[Any, Any]], seeds: Sequence[int]) -> Simulator:
     """The fastest simulator that there is for an environment.
 
     Args:
         make: makes the environment.
         seeds: of the resets.
-        threads: for the physics; results do not depend on it.
     """
     env = make()
     kernel = kernel_for(env)
     if kernel is not None:
-        return PhysicsSimulator(env, kernel, seeds, threads=threads)
+        return PhysicsSimulator(env, kernel, seeds)
     return GymnasiumSimulator([env, *(make() for _ in seeds[1:])], seeds)
 
 
@@ -91,17 +88,16 @@ class Start:
 class Physics:
     """A batch of MuJoCo simulations with the environment's kernel around it.
 
-    Bit by bit the physics of Gymnasium's ``step``, whatever the number of simulations or threads.
+    Bit by bit the physics of Gymnasium's ``step``, whatever the number of simulations.
 
     Args:
         kernel: the environment's.
         nsim: number of simulations.
-        threads: that step them.
     """
 
-    def __init__(self, kernel: Kernel, nsim: int, *, threads: int = 1) -> None:
+    def __init__(self, kernel: Kernel, nsim: int) -> None:
         self._kernel = kernel
-        self._batch = Batch(kernel.env.model, nsim, nthread=threads)
+        self._batch = Batch(kernel.env.model, nsim, nthread=1)
         self._fields = {name: self._batch.bind(name) for name in kernel.fields}
         self._starts = {name: self._batch.bind(name) for name in _START_FIELDS}
         self._ctrl = self._batch.bind("ctrl")
@@ -166,19 +162,16 @@ class PhysicsSimulator:
     name: str = "mujoco.batch"
     most: int | None = None
 
-    def __init__(
-        self, env: gym.Env[Any, Any], kernel: Kernel, seeds: Sequence[int], *, threads: int = 1
-    ) -> None:
+    def __init__(self, env: gym.Env[Any, Any], kernel: Kernel, seeds: Sequence[int]) -> None:
         self._env = env
         self._kernel = kernel
-        self._threads = threads
         self._starts = [start_of(kernel, env.reset(seed=seed)[0]) for seed in seeds]
-        self._physics = Physics(kernel, len(self._starts), threads=threads)
+        self._physics = Physics(kernel, len(self._starts))
 
     def reset(self, copies: int) -> np.ndarray:
         """See ``Simulator.reset``."""
         starts = self._starts * copies  # and new counters of instability
-        self._physics = Physics(self._kernel, len(starts), threads=self._threads)
+        self._physics = Physics(self._kernel, len(starts))
         self._physics.load(np.arange(len(starts)), starts)
         return np.stack([start.observation for start in starts])
 

@@ -7,13 +7,13 @@ whatever the size of the policy. A Gram matrix squares the condition number: sin
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from weighttraj.frames import distance
 from weighttraj.publish.curves import thin
 from weighttraj.run import Run
 
@@ -79,7 +79,7 @@ def walk(run: Run, advance: Callable[[int], None] = lambda rows: None) -> Walk:
         kept[mine] = block[chosen[mine] - start]
         for t, row in enumerate(block, start):
             broken += [] if np.isfinite(row).all() else [t]
-            steps += [] if last is None else [_distance(row, last)]
+            steps += [] if last is None else [distance(row, last)]
             last = row
         last = block[-1].copy()  # the block need not stay in memory
         advance(len(block))
@@ -115,17 +115,6 @@ def rank_for(walk: Walk, share: float) -> int | None:
     """The fewest components beyond which at most such a share is left; None: not resolved."""
     enough = np.flatnonzero(walk.beyond <= share)
     return int(enough[0]) + 1 if len(enough) else None
-
-
-def _distance(one: Float32[np.ndarray, " param"], other: Float32[np.ndarray, " param"]) -> float:
-    """Return the L2 distance of two snapshots; NaN if one of them is not finite."""
-    total = 0.0
-    for start in range(0, len(one), _COLUMNS):
-        part = slice(start, start + _COLUMNS)
-        with np.errstate(invalid="ignore"):
-            difference = one[part].astype(np.float64) - other[part]
-        total += float(difference @ difference)
-    return math.sqrt(total) if math.isfinite(total) else math.nan
 
 
 def _gram(rows: Float32[np.ndarray, "row param"]) -> Float64[np.ndarray, "row row"]:

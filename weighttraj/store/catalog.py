@@ -14,7 +14,7 @@ from weighttraj.atomic import replace_file
 from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.schema import DatasetInfo, load_json, parse, to_json
 from weighttraj.store.objects import FolderObjects, check_name, check_size, read_document
-from weighttraj.store.zarr_run import checksum
+from weighttraj.store.zarr_run import check_checksum, checksum
 
 DATASET = "dataset.json"
 MANIFEST = "MANIFEST.sha256"
@@ -53,14 +53,7 @@ def parse_dataset(content: bytes, where: object) -> DatasetInfo:
     document = load_json(content, where)
     stored = document.pop("sha256", None) if isinstance(document, dict) else None
     info = parse(document, DatasetInfo, where)
-    if stored != checksum(document):
-        raise DamageError(
-            "the list of runs does not match its checksum",
-            expected=stored,
-            got=checksum(document),
-            where=where,
-            do="restore the file from a copy; it is not to be edited by hand",
-        )
+    check_checksum(document, stored, where)
     return info
 
 
@@ -111,7 +104,7 @@ def check_file_names(path: Path) -> None:
 
 
 def read_manifest(path: Path) -> list[ManifestLine]:
-    """Lines of the manifest of the data set in a folder; raises as ``parse_manifest`` does."""
+    """Return the lines of a data set's manifest; raises as ``parse_manifest`` does."""
     return parse_manifest(read_document(FolderObjects(path), MANIFEST), path)
 
 

@@ -18,7 +18,7 @@ from numcodecs import blosc
 
 from weighttraj.errors import DamageError, FormatError, MissingExtraError
 from weighttraj.store.codecs import BLOCK_BYTES, MAX_RATIO, PLAIN, explodes, unshard
-from weighttraj.store.objects import Objects, missing_object
+from weighttraj.store.objects import Objects, fitting_memory
 
 _MISSING = 2**64 - 1
 _OVERHEAD = 1 << 20  # bytes of an object beside its chunks, at most
@@ -117,15 +117,8 @@ class RowDecoder:
         return self._tags[8 * position : 8 * position + 8]
 
     def _empty(self, shape: tuple[int, ...]) -> np.ndarray:
-        try:
+        with fitting_memory(f"{self._objects.path}, array {self._name!r}"):
             return np.empty(shape, self._dtype)
-        except MemoryError as error:
-            raise FormatError(
-                "this selection does not fit into memory",
-                got=error,
-                where=f"{self._objects.path}, array {self._name!r}",
-                do="read fewer rows at a time",
-            ) from error
 
     def _require(self, parts: list[range]) -> None:
         """Every chunk must be there before memory for them is taken."""
@@ -195,8 +188,7 @@ class RowDecoder:
         shape = self._chunk[::-1] if self._transposed else self._chunk
         try:
             if self._pco:
-                standalone = _pcodec(self._objects.path)
-                progress = standalone.simple_decompress_into(data, scratch)
+                progress = pcodec(self._objects.path).simple_decompress_into(data, scratch)
                 whole = progress.n_processed == scratch.size and progress.finished
             elif not self._blosc:
                 whole = len(data) == scratch.nbytes
@@ -230,7 +222,13 @@ class RowDecoder:
         return "/".join([self._name, "c", *map(str, index)])
 
     def _missing(self, index: tuple[int, ...]) -> DamageError:
-        return missing_object(self._key(index), self._objects.path)
+        return DamageError(
+            "committed data is missing",
+            expected=f"the object {self._key(index)}",
+            got="no such object",
+            where=self._objects.path,
+            do="restore the file from a copy, or collect the run again from its seed",
+        )
 
     def _damaged(self, index: tuple[int, ...], got: object) -> DamageError:
         return DamageError(
@@ -248,8 +246,12 @@ def grid(parts: list[range]) -> Iterator[tuple[int, ...]]:
         yield from ((i, *rest) for rest in grid(parts[1:])) if parts[1:] else [(i,)]
 
 
-def _pcodec(where: object) -> Any:
-    # Imported where it is used: reading the default profile needs no pcodec.
+def pcodec(where: object) -> Any:
+    """Return the module that decodes the archive profile: reading the default one needs none.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
     try:
         from pcodec import standalone
     except ModuleNotFoundError as error:

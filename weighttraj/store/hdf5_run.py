@@ -23,8 +23,8 @@ import numpy as np
 from weighttraj.errors import DamageError, FormatError, WeightTrajError
 from weighttraj.format.schema import ArraySpec, RunInfo, arrays_of, load_json, parse
 from weighttraj.store.codecs import FREE_CHUNK_BYTES
-from weighttraj.store.objects import check_name
-from weighttraj.store.zarr_run import ATTRIBUTE, checksum
+from weighttraj.store.objects import check_name, fitting_memory
+from weighttraj.store.zarr_run import ATTRIBUTE, check_checksum
 
 RUN = "run.json"
 """Metadata of a run, in the run's group: ``weighttraj``, ``arrays`` and their ``sha256``."""
@@ -99,15 +99,8 @@ class H5RunStore:
             DamageError: a block is missing, or is not what was written.
         """
         rows, *rest = key if isinstance(key, tuple) else (key,)
-        try:
+        with fitting_memory(f"{self.path}, array {name!r}"):
             return self._read(self.specs[name], rows, (slice(None), *rest))
-        except MemoryError as error:
-            raise FormatError(
-                "this selection does not fit into memory",
-                got=error,
-                where=f"{self.path}, array {name!r}",
-                do="read fewer rows at a time",
-            ) from error
 
     def chunk_rows(self, name: str) -> int:
         """Rows of an array that are decoded together."""
@@ -228,14 +221,7 @@ def _parse(document: Any, where: str) -> tuple[RunInfo, dict[str, Blocks]]:
     plain = document if isinstance(document, dict) else {}
     stored = plain.pop("sha256", None)
     info = parse(plain.get(ATTRIBUTE), RunInfo, where)
-    if stored != checksum(plain):
-        raise DamageError(
-            "the metadata does not match its checksum",
-            expected=stored,
-            got=checksum(plain),
-            where=where,
-            do=_RESTORE,
-        )
+    check_checksum(plain, stored, where)
     try:
         blocks = msgspec.convert(plain.get("arrays"), dict[str, Blocks])
         for name, spec in arrays_of(info).items():

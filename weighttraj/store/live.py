@@ -18,10 +18,11 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
 from weighttraj.atomic import DRAFT, drafting, lock_of, refuse_existing, replace_file, sync
-from weighttraj.errors import DamageError, FormatError, MissingExtraError, StoreLockedError
+from weighttraj.errors import DamageError, FormatError, StoreLockedError
 from weighttraj.format.schema import AXES, RunInfo, arrays_of
 from weighttraj.remote.address import Place
 from weighttraj.store.codecs import create_array, quiet_codecs, rows_in_block
+from weighttraj.store.decode import pcodec
 from weighttraj.store.encode import ObjectEncoder
 from weighttraj.store.objects import FolderObjects, check_size
 from weighttraj.store.zarr_run import (
@@ -329,12 +330,9 @@ def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]
     try:
         with zarr.config.set(_EMPTY_CHUNKS), quiet_codecs():
             return zarr.open_array(store, path=name, mode=mode, zarr_format=3)
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"the archive profile needs {error.name}, which is not installed",
-            where=where,
-            do="pip install 'numcodecs[pcodec]'",
-        ) from error
+    except ModuleNotFoundError:
+        pcodec(where)
+        raise
     except Exception as error:  # Zarr has no error of its own for metadata it cannot parse
         raise DamageError(
             "the metadata of an array is damaged",

@@ -1,11 +1,12 @@
 """Where the bytes of a run are: objects under a name, in a folder or in one zip file.
 
 Nothing here keeps a file open, so objects survive fork, spawn and pickling. Those that are not on
-this machine are in ``format.remote``.
+this machine are in ``store.remote``.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
@@ -94,7 +95,7 @@ class FileBlob:
         try:
             if os.fstat(handle).st_ino != self._inode:
                 raise replaced(self.path)
-            return _read_range(handle, 0, self.size, start, stop)
+            return _read_range(handle, self.size, start, stop)
         finally:
             os.close(handle)
 
@@ -120,7 +121,7 @@ class FolderObjects:
             status = os.fstat(handle)
             if not stat.S_ISREG(status.st_mode):
                 return None
-            return _read_range(handle, 0, status.st_size, start, stop)
+            return _read_range(handle, status.st_size, start, stop)
         finally:
             os.close(handle)
 
@@ -311,6 +312,24 @@ def check_size(content: bytes, where: object, limit: int = MAX_DOCUMENT_BYTES) -
     return content
 
 
+@contextlib.contextmanager
+def fitting_memory(where: object) -> Iterator[None]:
+    """Make room for a selection of an array inside.
+
+    Raises:
+        FormatError: there is not enough memory.
+    """
+    try:
+        yield
+    except MemoryError as error:
+        raise FormatError(
+            "this selection does not fit into memory",
+            got=error,
+            where=where,
+            do="read fewer rows at a time",
+        ) from error
+
+
 def replaced(where: object) -> FormatError:
     """The error for a packed run that is not the one any more that was opened."""
     return FormatError(
@@ -338,17 +357,6 @@ def check_name(name: str, where: object) -> str:
     return name
 
 
-def missing_object(name: str, where: object) -> DamageError:
-    """The error for an object that was committed and is not there."""
-    return DamageError(
-        "committed data is missing",
-        expected=f"the object {name}",
-        got="no such object",
-        where=where,
-        do="restore the file from a copy, or collect the run again from its seed",
-    )
-
-
 def write_zip(path: Path, members: Iterable[tuple[str, Path | ZipObjects]]) -> None:
     """Write files into a zip file: stored, without times, so equal content gives equal bytes.
 
@@ -360,23 +368,19 @@ def write_zip(path: Path, members: Iterable[tuple[str, Path | ZipObjects]]) -> N
         for name, source in members:
             info = zipfile.ZipInfo(name)  # 1980-01-01
             # Zip files write it first: it says whether the sizes need 64 bits.
-            info.file_size = _size_of(name, source)
+            if isinstance(source, ZipObjects):
+                info.file_size = source.size(name) or 0
+            else:
+                info.file_size = source.stat().st_size
             with archive.open(info, "w") as writer:
                 for piece in _pieces(name, source):
                     writer.write(piece)
 
 
-def _size_of(name: str, source: Path | ZipObjects) -> int:
-    """Bytes of a file or member."""
-    if isinstance(source, ZipObjects):
-        return source.size(name) or 0
-    return source.stat().st_size
-
-
 def _pieces(name: str, source: Path | ZipObjects) -> Iterator[bytes]:
     """The bytes of a file or member, some at a time."""
     if isinstance(source, ZipObjects):
-        for start in range(0, _size_of(name, source), _PIECE_BYTES):
+        for start in range(0, source.size(name) or 0, _PIECE_BYTES):
             yield source.read(name, start, start + _PIECE_BYTES) or b""
         return
     with source.open("rb") as reader:
@@ -396,7 +400,7 @@ def read_plain(path: Path, limit: int) -> bytes:
         try:
             status = os.fstat(handle)
             if stat.S_ISREG(status.st_mode) and status.st_size <= limit:
-                return _read_range(handle, 0, status.st_size, 0, limit)
+                return _read_range(handle, status.st_size, 0, limit)
         finally:
             os.close(handle)
         got: object = "another kind of file, or a larger one"
@@ -411,13 +415,13 @@ def read_plain(path: Path, limit: int) -> bytes:
     )
 
 
-def _read_range(handle: int, offset: int, size: int, start: int, stop: int | None) -> bytes:
+def _read_range(handle: int, size: int, start: int, stop: int | None) -> bytes:
     if start < 0:
         start = max(0, size + start)
     stop = size if stop is None else min(stop, size)
     pieces, at = [], start
     while at < stop:  # one call reads at most 2 GiB
-        piece = os.pread(handle, stop - at, offset + at)
+        piece = os.pread(handle, stop - at, at)
         if not piece:
             break
         pieces.append(piece)

@@ -184,15 +184,7 @@ def read_metadata(objects: Objects) -> Metadata:
             do="open a run, <data set>/runs/<id>.zarr",
         )
     info = parse(attributes[ATTRIBUTE], RunInfo, where)
-    stored = attributes.pop(CHECKSUM, None)
-    if stored != checksum(document):
-        raise DamageError(
-            "the metadata does not match its checksum",
-            expected=stored,
-            got=checksum(document),
-            where=where,
-            do="restore the file from a copy",
-        )
+    check_checksum(document, attributes.pop(CHECKSUM, None), where)
     documents, tags = _array_documents(document, where), attributes.get(TAGS)
     for name, spec in arrays_of(info).items():
         if name not in documents:
@@ -291,6 +283,18 @@ def checksum(metadata: Any) -> str:
     """SHA-256 of metadata as JSON with sorted keys and no spaces."""
     text = json.dumps(metadata, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def check_checksum(metadata: Any, stored: object, where: object) -> None:
+    """Raise DamageError if metadata do not match the checksum that is stored with them."""
+    if stored != (got := checksum(metadata)):
+        raise DamageError(
+            "the metadata does not match its checksum",
+            expected=stored,
+            got=got,
+            where=where,
+            do="restore the file from a copy; it is not to be edited by hand",
+        )
 
 
 def _columns(

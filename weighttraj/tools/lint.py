@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,14 +11,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from weighttraj.opening import open_dataset, open_run
+from weighttraj.frames import distance
+from weighttraj.opening import open_dataset
 from weighttraj.remote.address import here
 from weighttraj.run import Run
 
 JUMP = 30.0
 """A step is a discontinuity if it is so many times the median of the steps around it."""
-
-_COLUMNS = 1 << 20
 
 AROUND = 25
 """Steps before and after that a step is compared with."""
@@ -53,15 +51,14 @@ def lint(path: str | Path, *, console: Console | None = None) -> list[Finding]:
     snapshots than the other runs have), ``twin`` (runs with the same weights).
 
     Args:
-        path: data set or run.
+        path: data set, run or HDF5 file.
         console: where progress is shown; None: nowhere.
 
     Raises:
         FileNotFoundError: there is neither a data set nor a run at the path.
         DamageError: it is not whole: see ``verify``.
     """
-    path = here(path)
-    runs = open_dataset(path).runs if (path / "dataset.json").is_file() else [open_run(path)]
+    runs = open_dataset(here(path)).runs
     bar = track(runs, "runs", console=console, disable=console is None, transient=True)
     findings = [finding for run in bar for finding in lint_run(run)]
     return findings + list(_between(runs))
@@ -126,7 +123,7 @@ def _weights(run: Run) -> Iterator[tuple[str, str]]:
         for t, row in enumerate(rows, start):
             moved |= row != first
             bad += [] if np.isfinite(row).all() else [t]
-            lengths.append(_distance(row, last))
+            lengths.append(distance(row, last))
             last = row
         last = last.copy()  # the piece need not stay in memory
     if bad:
@@ -139,16 +136,6 @@ def _weights(run: Run) -> Iterator[tuple[str, str]]:
     jumps = _jumps(np.array(lengths)[1:])
     if jumps:
         yield "jump", f"steps {JUMP:g} times longer than those around them end at {_some(jumps)}"
-
-
-def _distance(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the L2 distance of two snapshots in float64, some parameters at a time."""
-    total = 0.0
-    for start in range(0, len(one), _COLUMNS):
-        part = slice(start, start + _COLUMNS)
-        with np.errstate(invalid="ignore"):  # infinite weights are a finding of their own
-            total += float(((one[part].astype(np.float64) - other[part]) ** 2).sum())
-    return math.sqrt(total)
 
 
 def _behind_silent_inputs(run: Run) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import filecmp
 import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import replace
@@ -186,7 +186,7 @@ def same_as_packed(path: Path) -> bool:
     with unpacked(path) as folder:
         again = folder.with_name("again.zip")
         write_zip(again, ((name, folder / name) for name in ZipObjects(path).names))
-        return _equal(path, again)
+        return filecmp.cmp(path, again, shallow=False)
 
 
 @contextlib.contextmanager
@@ -206,13 +206,3 @@ def _members(folder: Path) -> Iterator[tuple[str, Path]]:
     files = {f.relative_to(folder).as_posix(): f for f in folder.rglob("*") if f.is_file()}
     for name in sorted(files, key=packed_order):
         yield name, files[name]
-
-
-def _equal(one: Path, other: Path) -> bool:
-    if os.path.getsize(one) != os.path.getsize(other):
-        return False
-    with one.open("rb") as a, other.open("rb") as b:
-        while piece := a.read(1 << 22):
-            if piece != b.read(len(piece)):
-                return False
-    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator
@@ -139,11 +140,11 @@ def read_table(folder: Path, name: str, rows: int) -> pa.Table:
         FormatError: it is a link.
         MissingExtraError: pyarrow is not installed.
     """
-    pa = _pyarrow()
+    _pyarrow()
     import pyarrow.parquet as pq
 
     file, limit = FolderObjects(folder).file(name), _BASE_BYTES + rows * _ROW_BYTES
-    try:
+    with _readable(file, f"{rows} rows, at most {limit:,} bytes of numbers and text"):
         if os.path.getsize(file) > limit:
             raise ValueError(f"a file of {os.path.getsize(file)} bytes")
         with pq.ParquetFile(file) as stored:
@@ -151,32 +152,32 @@ def read_table(folder: Path, name: str, rows: int) -> pa.Table:
         # Equal texts stay one text until their sizes are known.
         with pq.ParquetFile(file, read_dictionary=texts) as stored:
             table = stored.read(use_threads=False)
-            for text in texts:
-                table = _decoded(table, text, limit)
-            if len(table) != rows:
-                raise ValueError(f"{len(table)} rows")
-            return table.replace_schema_metadata(None)  # what pandas wrote there is not needed
-    except (pa.ArrowException, ValueError, OSError, MemoryError, UnicodeDecodeError) as error:
-        raise DamageError(
-            "a table of the data set is damaged, or not what it should be",
-            expected=f"{rows} rows, at most {limit:,} bytes of numbers and text",
-            got=error,
-            where=file,
-            do="write it again: weighttraj repair",
-        ) from error
+        for text in texts:
+            table = _decoded(table, text, limit)
+        if len(table) != rows:
+            raise ValueError(f"{len(table)} rows")
+    return table.replace_schema_metadata(None)  # what pandas wrote there is not needed
 
 
 def read_schema(folder: Path, name: str) -> pa.Schema:
     """Read the columns of a table of a data set; the errors are those of ``read_table``."""
-    pa = _pyarrow()
+    _pyarrow()
     import pyarrow.parquet as pq
 
     file = FolderObjects(folder).file(name)
-    try:
+    with _readable(file, "a Parquet file"):
         return pq.read_schema(file)
-    except (pa.ArrowException, ValueError, OSError, MemoryError) as error:
+
+
+@contextlib.contextmanager
+def _readable(file: str, expected: str) -> Iterator[None]:
+    """Read a table inside; whatever Arrow raises is damage."""
+    try:
+        yield
+    except (_pyarrow().ArrowException, ValueError, OSError, MemoryError) as error:
         raise DamageError(
             "a table of the data set is damaged, or not what it should be",
+            expected=expected,
             got=error,
             where=file,
             do="write it again: weighttraj repair",

@@ -23,9 +23,7 @@ from weighttraj.format.schema import load_json
 from weighttraj.opening import open_dataset, open_run
 from weighttraj.remote.address import here
 from weighttraj.run import Run, StoredArray
-from weighttraj.store.catalog import (
-    check_manifest,
-)
+from weighttraj.store.catalog import check_manifest
 from weighttraj.store.objects import ZipObjects, read_document
 from weighttraj.store.zarr_run import MAX_METADATA, RunStore, member_documents, object_grid
 from weighttraj.tools.pack import same_as_packed
@@ -152,17 +150,15 @@ def _is_earlier(store: RunStore, name: str, content: bytes) -> bool:
 def _verify_array(name: str, array: StoredArray, *, where: str) -> Iterator[str]:
     last = None
     for start, rows in array.pieces():
-        if name == "policy/weights" and (bad := [i for i, r in enumerate(rows) if not _finite(r)]):
+        if name == "policy/weights" and (
+            bad := [i for i, r in enumerate(rows) if not np.isfinite(r).all()]
+        ):
             yield f"{where}, {name}: not finite at row {start + bad[0]}"
         if name in MONOTONE:
             steps = np.diff(rows, prepend=rows[:1] if last is None else last)
             if (steps < 0).any():
                 yield f"{where}, {name}: goes back at row {start + int(np.argmax(steps < 0))}"
             last = rows[-1:]
-
-
-def _finite(row: np.ndarray) -> bool:
-    return bool(np.isfinite(row).all())
 
 
 def _chunk_keys(store: RunStore, name: str) -> Iterator[str]:
