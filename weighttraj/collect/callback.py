@@ -20,6 +20,7 @@ from weighttraj.collect.guard import Guard
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.origin import find_origin, find_source
 from weighttraj.collect.recorder import Counters, Reading, Recorder
+from weighttraj.collect.settings import Store
 from weighttraj.collect.watch import Watch
 from weighttraj.errors import CollectError, PolicyError
 from weighttraj.format import RunInfo
@@ -110,14 +111,16 @@ class WeightTrajectoryCallback(BaseCallback):
                 got=every,
             )
         self.path = Path(path)
-        self.every = every
         self.unit: Unit = "update" if unit == "update" else "gradient_step"
         self.run_id = run_id or self.path.name.removesuffix(".zarr")
         self.continues = continues
-        self.critic = critic
-        self.optimizer_moments = optimizer_moments
-        self.probe_observations = probe_observations
-        self.block = block
+        self.store = Store(
+            every=every,
+            critic=critic,
+            optimizer_moments=optimizer_moments,
+            probe_observations=probe_observations,
+            block=block,
+        )
         self.resume = resume
         self._agent: Agent
         self._watch: Watch
@@ -167,7 +170,7 @@ class WeightTrajectoryCallback(BaseCallback):
             self.path,
             info,
             self._read,
-            every=self.every,
+            every=self.store.every,
             steps_per_epoch=steps // getattr(self.model, "n_epochs", 1) if steps else None,
             rollouts=self._agent.has_rollouts,
             start=counters,
@@ -181,7 +184,7 @@ class WeightTrajectoryCallback(BaseCallback):
     def _check_options(self) -> None:
         """Raise CollectError if something is to be stored that the algorithm does not have."""
         agent, name = self._agent, type(self.model).__name__
-        if self.optimizer_moments and not isinstance(agent.optimizer, torch.optim.Adam):
+        if self.store.optimizer_moments and not isinstance(agent.optimizer, torch.optim.Adam):
             raise CollectError(
                 "this optimizer has no moments to store",
                 expected="Adam or AdamW",
@@ -189,7 +192,7 @@ class WeightTrajectoryCallback(BaseCallback):
                 where=name,
                 do="leave optimizer_moments out",
             )
-        if self.critic and not agent.critic:
+        if self.store.critic and not agent.critic:
             raise CollectError(
                 "this algorithm has no critic apart from the network that acts",
                 expected="an actor and a critic, as in PPO or SAC",
@@ -199,16 +202,7 @@ class WeightTrajectoryCallback(BaseCallback):
 
     def _describe(self) -> tuple[RunInfo, Counters]:
         """Return the run's metadata and the counters that it starts with."""
-        info = describe_run(
-            self._agent,
-            self._norm,
-            run_id=self.run_id,
-            every=self.every,
-            critic=self.critic,
-            optimizer_moments=self.optimizer_moments,
-            probe_observations=self.probe_observations,
-            block=self.block,
-        )
+        info = describe_run(self._agent, self._norm, self.run_id, self.store)
         self._timesteps_before = 0
         if self.continues is None:
             return replace(info, continues=find_origin(self._agent)), Counters()
@@ -318,8 +312,8 @@ class WeightTrajectoryCallback(BaseCallback):
             "learning_rate": agent.learning_rate,
             "obs_norm": norm.read_obs() if norm.read_obs else None,
             "ret_norm": norm.read_ret() if norm.read_ret else None,
-            "critic": _flat(list(agent.critic.values())) if self.critic else None,
-            "moments": self._moments() if self.optimizer_moments else None,
+            "critic": _flat(list(agent.critic.values())) if self.store.critic else None,
+            "moments": self._moments() if self.store.optimizer_moments else None,
         }
 
     def _diagnostics(self) -> dict[str, float]:

@@ -26,6 +26,7 @@ from weighttraj.collect.agents import Agent, actor_parameters
 from weighttraj.collect.environment import describe_env
 from weighttraj.collect.normalizers import Normalizers
 from weighttraj.collect.proof import find_difference, own_methods
+from weighttraj.collect.settings import Store
 from weighttraj.format import Algorithm, Cadence, ParamLayout, PolicySpec, Provenance, RunInfo
 from weighttraj.format.layout import Role
 
@@ -103,29 +104,20 @@ def diagnostics_of(model: BaseAlgorithm) -> tuple[str, ...]:
 def describe_run(
     agent: Agent,
     norm: Normalizers,
-    *,
     run_id: str,
-    every: int,
-    critic: bool,
-    optimizer_moments: bool,
-    probe_observations: int,
-    block: int,
+    store: Store,
 ) -> RunInfo:
-    """The metadata of a run, before its training.
+    """Return the metadata of a run, before its training.
 
     Args:
         agent: what will be trained.
         norm: its normalisers.
         run_id: id of the run.
-        every: gradient steps from one snapshot to the next.
-        critic: whether the critic's parameters are stored.
-        optimizer_moments: whether Adam's moments are stored.
-        probe_observations: network inputs kept of each rollout.
-        block: snapshots in a chunk and in a commit.
+        store: what is stored, and how often.
     """
     model, on_policy = agent.model, agent.on_policy
     policy = describe_agent(agent, norm.unknown)
-    probes = probe_observations if policy.observation_shape else 0
+    probes = store.probe_observations if policy.observation_shape else 0
     return RunInfo(
         run_id=run_id,
         layout=describe_layout(agent.actor, policy),
@@ -133,15 +125,15 @@ def describe_run(
         env=describe_env(model.env, norm),
         algorithm=describe_algorithm(agent),
         seed=model.seed,
-        cadence=describe_cadence(agent, every),
+        cadence=describe_cadence(agent, store.every),
         obs_norm=norm.obs_norm,
         ret_norm=norm.read_ret is not None,
         diagnostics=(*diagnostics_of(model), "ep_rew_mean"),
-        critic_layout=describe_layout(agent.critic, policy) if critic else None,
-        optimizer_moments=optimizer_moments,
+        critic_layout=describe_layout(agent.critic, policy) if store.critic else None,
+        optimizer_moments=store.optimizer_moments,
         probe_observations=min(probes, on_policy.n_steps * on_policy.n_envs) if on_policy else 0,
         provenance=describe_provenance(),
-        block=block,
+        block=store.block,
     )
 
 
@@ -195,10 +187,7 @@ def _off_policy(agent: Agent) -> tuple[PolicySpec, list[str]]:
     log_std = tuple(f"{agent.prefix}{name}" for name in log_std)
     reasons += [*odd, *more]
     reasons += _other_parameters(agent.actor, {n for pair in (*layers, log_std) for n in pair})
-    if not isinstance(space, spaces.Box):
-        reasons.append(f"observations in a {type(space).__name__} space")
-    if is_image_space(space):
-        reasons.append("observations that SB3 takes for images and scales")
+    reasons += _odd_observations(space)
     spec = PolicySpec(
         kind="other",
         acting=acting,
@@ -223,13 +212,8 @@ def _parts(network: Any) -> tuple[Acting, nn.Sequential, str, str, tuple[str, ..
         return "squashed", nn.Sequential(*list(mu.children())[:-2]), "mu", f"mu.{len(mu) - 2}", ()
     net = getattr(network, "q_net", None)
     if isinstance(net, nn.Sequential) and len(net):  # DQN
-        return (
-            "greedy",
-            nn.Sequential(*list(net.children())[:-1]),
-            "q_net",
-            f"q_net.{len(net) - 1}",
-            (),
-        )
+        hidden = nn.Sequential(*list(net.children())[:-1])
+        return "greedy", hidden, "q_net", f"q_net.{len(net) - 1}", ()
     return None
 
 
@@ -271,10 +255,7 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
     reasons += odd
     if policy.squash_output:
         reasons.append("actions squashed by tanh")
-    if not isinstance(space, spaces.Box):
-        reasons.append(f"observations in a {type(space).__name__} space")
-    if is_image_space(space):
-        reasons.append("observations that SB3 takes for images and scales")
+    reasons += _odd_observations(space)
     if layers and not reasons:
         wanted = {name for pair in layers for name in pair}
         gaussian = {"log_std"} if head["head"] == "gaussian" else set()
@@ -287,6 +268,16 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
         **head,
     )
     return spec, reasons
+
+
+def _odd_observations(space: spaces.Space[Any]) -> list[str]:
+    """Reasons why a multilayer perceptron does not see the observations as they are."""
+    reasons = []
+    if not isinstance(space, spaces.Box):
+        reasons.append(f"observations in a {type(space).__name__} space")
+    if is_image_space(space):
+        reasons.append("observations that SB3 takes for images and scales")
+    return reasons
 
 
 def _other_parameters(parameters: dict[str, nn.Parameter], wanted: set[str]) -> list[str]:
@@ -351,10 +342,7 @@ def describe_algorithm(agent: Agent, collector: str = "") -> Algorithm:
 
 def describe_cadence(agent: Agent, every: int) -> Cadence:
     """Return when snapshots are taken."""
-    if agent.unit == "update":
-        steps: int | None = 1
-    else:
-        steps = _steps_of_an_update(agent.model)
+    steps = 1 if agent.unit == "update" else _steps_of_an_update(agent.model)
     return Cadence(every=every, unit=agent.unit, gradient_steps_per_iteration=steps)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -118,16 +118,8 @@ def open_recorder(
         ReplayError: it begins otherwise.
     """
     model, agent = origin.model, find_agent(origin.model)
-    info = describe_run(
-        agent,
-        find_normalizers(cast(VecEnv, model.get_env())),
-        run_id=path.name.removesuffix(".zarr"),
-        every=store.every,
-        critic=store.critic,
-        optimizer_moments=store.optimizer_moments,
-        probe_observations=store.probe_observations,
-        block=store.block,
-    )
+    norm = find_normalizers(cast(VecEnv, model.get_env()))
+    info = describe_run(agent, norm, path.name.removesuffix(".zarr"), store)
     return Recorder(
         path,
         replace(info, algorithm=describe_algorithm(agent, "weighttraj's population")),
@@ -140,17 +132,9 @@ def open_recorder(
 
 def _train(task: Task, report: Report) -> None:
     """Train and record one run by SB3."""
-    store, config = task.recipe.store, task.recipe.ppo
-    callback = WeightTrajectoryCallback(
-        task.path,
-        every=store.every,
-        critic=store.critic,
-        optimizer_moments=store.optimizer_moments,
-        probe_observations=store.probe_observations,
-        block=store.block,
-        resume=True,
-    )
-    with callback:
+    config, settings = task.recipe.ppo, asdict(task.recipe.store)
+    del settings["profile"]  # of the packed run
+    with WeightTrajectoryCallback(task.path, **settings, resume=True) as callback:
         model = make_ppo(config, seed=task.seed)
         progress = _ProgressCallback(task.seed, report)
         model.learn(config.n_iterations * config.n_steps, callback=[callback, progress])
@@ -188,10 +172,9 @@ class _Follower:
         self._population = population
         self._report = report
         self._recorder: Recorder | None = None
-        store = task.recipe.store
         try:
             self._recorder = open_recorder(
-                population, learner, origin, task.path, store, resume=True
+                population, learner, origin, task.path, task.recipe.store, resume=True
             )
         except Exception as error:
             self.error = error

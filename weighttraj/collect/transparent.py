@@ -7,13 +7,14 @@ and keeps the actions that reach it. The training's own environment is never ste
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from weighttraj.collect.undisturbed import undisturbed
 
@@ -28,108 +29,68 @@ def is_transparent(wrapper: gym.Wrapper[Any, Any, Any, Any]) -> bool:
     Args:
         wrapper: around one environment. It may change rewards and the ends of episodes.
     """
-    if not _same_spaces(wrapper, wrapper.env):
-        return False
     kind = type(wrapper)
     if isinstance(wrapper, gym.RewardWrapper) and kind.step is gym.RewardWrapper.step:
-        return kind.reset is gym.Wrapper.reset  # its own code sees nothing but the reward
-    with undisturbed():
-        try:
-            inside = _Inside(wrapper.env)
-            return _try(_around(wrapper, "env", inside), inside)
-        except Exception:  # the code of a stranger may raise anything
-            return False
+        # Its own code sees nothing but the reward.
+        return kind.reset is gym.Wrapper.reset and _same_spaces(wrapper, wrapper.env)
+
+    def attempt() -> bool:
+        inside = _Inside(wrapper.env)
+        around = _around(wrapper, "env", inside)
+        return _passes(lambda: around.reset()[0], lambda action: around.step(action)[0], [inside])
+
+    return _same_spaces(wrapper, wrapper.env) and _tried(attempt)
 
 
 def is_transparent_vec(wrapper: VecEnvWrapper) -> bool:
     """The same for a wrapper around a vectorised environment."""
-    if not _same_spaces(wrapper, wrapper.venv):
-        return False
+
+    def attempt() -> bool:
+        venv = DummyVecEnv([partial(_Inside, wrapper.venv, 2 * i) for i in range(wrapper.num_envs)])
+        insides = cast(list[_Inside], venv.envs)
+        around = _around(wrapper, "venv", venv)
+        return _passes(around.reset, lambda actions: around.step(actions)[0], insides, stack=True)
+
+    return _same_spaces(wrapper, wrapper.venv) and _tried(attempt)
+
+
+def _tried(attempt: Callable[[], bool]) -> bool:
+    """Whether a trial succeeds, and raises nothing."""
     with undisturbed():
         try:
-            inside = _InsideVec(wrapper.venv)
-            return _try_vec(_around(wrapper, "venv", inside), inside)
+            return attempt()
         except Exception:  # the code of a stranger may raise anything
             return False
 
 
-class _Samples:
-    """Observations and actions of some spaces, drawn by generators of their own."""
-
-    def __init__(self, observation: spaces.Space[Any], action: spaces.Space[Any]) -> None:
-        self._observation, self._action = copy.deepcopy(observation), copy.deepcopy(action)
-        self._observation.seed(0)
-        self._action.seed(1)
-
-    def observation(self) -> np.ndarray:
-        return np.asarray(self._observation.sample())
-
-    def action(self) -> np.ndarray:
-        return np.asarray(self._action.sample())
-
-
 class _Inside(gym.Env[Any, Any]):
-    """Stands in for an environment: returns known observations, keeps the actions."""
+    """Stands in for an environment: returns known observations, keeps the actions.
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self.observation_space, self.action_space = env.observation_space, env.action_space
-        self.spec, self.metadata, self.render_mode = env.spec, env.metadata, env.render_mode
-        self.samples = _Samples(self.observation_space, self.action_space)
-        self.observation: np.ndarray = self.samples.observation()
+    Args:
+        env: whose spaces it has; vectorised ones have those of a single environment.
+        seed: of its observations and of the actions that it is given.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any] | VecEnv, seed: int = 0) -> None:
+        self.observation_space = copy.deepcopy(env.observation_space)
+        self.action_space = copy.deepcopy(env.action_space)
+        self.observation_space.seed(seed)
+        self.action_space.seed(seed + 1)
+        if isinstance(env, gym.Env):
+            self.spec, self.metadata, self.render_mode = env.spec, env.metadata, env.render_mode
+        self.observation = np.asarray(self.observation_space.sample())
         self.actions: list[Any] = []
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        self.observation = self.samples.observation()
+        self.observation = np.asarray(self.observation_space.sample())
         return self.observation.copy(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.actions.append(np.array(action))
-        self.observation = self.samples.observation()
-        return self.observation.copy(), float(len(self.actions) % 7), False, False, {}
-
-
-class _InsideVec(VecEnv):
-    """Stands in for a vectorised environment."""
-
-    def __init__(self, venv: VecEnv) -> None:
-        self.render_mode = None
-        super().__init__(venv.num_envs, venv.observation_space, venv.action_space)
-        self.samples = _Samples(self.observation_space, self.action_space)
-        self.observation: np.ndarray = self._observe()
-        self.actions: list[np.ndarray] = []
-
-    def _observe(self) -> np.ndarray:
-        return np.stack([self.samples.observation() for _ in range(self.num_envs)])
-
-    def reset(self) -> Any:
-        self.observation = self._observe()
-        return self.observation.copy()
-
-    def step_async(self, actions: np.ndarray) -> None:
-        self.actions.append(np.array(actions))
-
-    def step_wait(self) -> Any:
-        self.observation = self._observe()
-        rewards = np.arange(self.num_envs, dtype=np.float32) + len(self.actions) % 7
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        return self.observation.copy(), rewards, np.zeros(self.num_envs, bool), infos
-
-    def close(self) -> None:
-        pass
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self, attr_name)] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise AttributeError(attr_name)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
-        raise AttributeError(method_name)
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False] * self.num_envs
+        observation, _ = self.reset()
+        return observation, float(len(self.actions) % 7), False, False, {}
 
 
 def _around(wrapper: Any, attribute: str, inside: Any) -> Any:
@@ -141,29 +102,35 @@ def _around(wrapper: Any, attribute: str, inside: Any) -> Any:
     return around
 
 
-def _try(around: Any, inside: _Inside) -> bool:
-    for step in range(_STEPS):
-        if step % _RESET_EVERY == 0 and not _equal(around.reset()[0], inside.observation):
-            return False
-        action = inside.samples.action()
-        observation = around.step(action.copy())[0]
-        if len(inside.actions) != step + 1 or not _equal(inside.actions[-1], action):
-            return False
-        if not _equal(observation, inside.observation):
-            return False
-    return True
+def _passes(
+    reset: Callable[[], Any],
+    step: Callable[[Any], Any],
+    insides: Sequence[_Inside],
+    *,
+    stack: bool = False,
+) -> bool:
+    """Whether all observations and actions pass through.
 
+    Args:
+        reset: begins episodes; returns observations.
+        step: takes actions; returns observations.
+        insides: what is wrapped.
+        stack: observations and actions are stacks of those of all insides; else of the only one.
+    """
 
-def _try_vec(around: Any, inside: _InsideVec) -> bool:
-    for step in range(_STEPS):
-        if step % _RESET_EVERY == 0 and not _equal(around.reset(), inside.observation):
+    def of_all(parts: Sequence[Any]) -> np.ndarray:
+        return np.stack(parts) if stack else np.asarray(parts[0])
+
+    for i in range(_STEPS):
+        if i % _RESET_EVERY == 0 and not _equal(reset(), of_all([x.observation for x in insides])):
             return False
-        actions = np.stack([inside.samples.action() for _ in range(inside.num_envs)])
-        around.step_async(actions.copy())
-        observations = around.step_wait()[0]
-        if len(inside.actions) != step + 1 or not _equal(inside.actions[-1], actions):
+        actions = of_all([np.asarray(inside.action_space.sample()) for inside in insides])
+        observations = step(actions.copy())
+        if any(len(inside.actions) != i + 1 for inside in insides):
             return False
-        if not _equal(observations, inside.observation):
+        if not _equal(of_all([inside.actions[-1] for inside in insides]), actions):
+            return False
+        if not _equal(observations, of_all([inside.observation for inside in insides])):
             return False
     return True
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote, unquote
 
-import jinja2
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from rich.console import Console
@@ -25,7 +24,7 @@ from weighttraj.atomic import replace_file
 from weighttraj.errors import FormatError, WeightTrajError
 from weighttraj.publish import figures
 from weighttraj.publish.curves import KINDS, curves
-from weighttraj.publish.report import MARK, refuse_foreign, report, shown
+from weighttraj.publish.report import MARK, refuse_foreign, report, template
 from weighttraj.publish.source import Source, facts, lead, open_source
 from weighttraj.publish.svg import Picture
 from weighttraj.store.objects import MAX_NAME, read_plain
@@ -97,7 +96,7 @@ def gallery(
     for card in cards:
         with _left_out(console):
             models.append(_model(card, out))
-    page = _environment().get_template("gallery.html.j2")
+    page = template("gallery.html.j2")
     text = page.render(mark=MARK, datasets=found, models=models, script=SCRIPT, hash=_hash(SCRIPT))
     replace_file(out / INDEX, text.encode())
     return out / INDEX
@@ -183,7 +182,7 @@ def _write_card(text: str, card: Path, out: Path, page: str) -> str:
         file = out / page / name
         file.parent.mkdir(exist_ok=True)
         replace_file(file, read_plain(card.with_name(name), MAX_PICTURE))
-    rendered = _environment().get_template("card.html.j2")
+    rendered = template("card.html.j2")
     body = rendered.render(mark=MARK, name=page.partition("/")[2], body=html)
     replace_file(target, body.encode())
     return quote(f"{page}.html")
@@ -255,18 +254,6 @@ def _outward(
         else:
             kept.append(token)
     return kept
-
-
-def _environment() -> jinja2.Environment:
-    loader = jinja2.PackageLoader("weighttraj.publish", "templates")
-    return jinja2.Environment(
-        loader=loader,
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=shown,
-    )
 
 
 def _hash(script: str) -> str:

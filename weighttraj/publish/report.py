@@ -136,13 +136,7 @@ def _page(source: Source, *, film: bool, seed: int, progress: Progress) -> str:
             why_not = f"Run {runs[typical].id} has weights that are NaN or infinite."
         else:
             movie, why_not = _film(runs[typical], seed, progress, playing)
-    loader = jinja2.PackageLoader("weighttraj.publish", "templates")
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.undefined = jinja2.StrictUndefined
-    environment.finalize = shown
-    return environment.get_template("report.html.j2").render(
+    return template("report.html.j2").render(
         mark=MARK,
         source=source,
         lead=lead(source),
@@ -164,6 +158,18 @@ def _broken(run: Run, walk: Walk) -> str:
         f"or infinite, the first at t = {walk.broken[0]:,}. They are left out of the figures of "
         "steps, spectrum and path."
     )
+
+
+def template(name: str) -> jinja2.Template:
+    """Return a template of a page; text that may be a stranger's is escaped in it."""
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("weighttraj.publish", "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=shown,
+    ).get_template(name)
 
 
 def shown(value: Any) -> Any:
