@@ -154,22 +154,29 @@ def remove_abandoned(target: Path) -> None:
 
 
 @contextlib.contextmanager
-def appearing(path: Path) -> Iterator[Path]:
+def appearing(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a path at which a new file or folder is to be made; it then moves to ``path``.
 
-    Whatever stops the process, there is nothing at the path, or all of it.
+    Whatever stops the process, there is nothing new at the path, or all of it. The folder of the
+    yielded path has room for other drafts.
+
+    Args:
+        path: the file or folder.
+        replace: replace a file that is there; else the path must be a new one.
 
     Raises:
-        StoreExistsError: the path exists.
+        StoreExistsError: the path exists, and is not to be replaced.
     """
-    refuse_existing(path)
+    if not replace:
+        refuse_existing(path)
     with drafting(path) as folder:
         draft = folder / path.name
         yield draft
         for file in (draft, *draft.rglob("*")):
             sync(file)
-        refuse_existing(path)
-        draft.rename(path)
+        if not replace:
+            refuse_existing(path)
+        draft.replace(path)
     sync(path.parent)
 
 

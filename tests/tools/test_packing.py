@@ -137,13 +137,14 @@ def test_equal_runs_are_equal_files(tmp_path: Path) -> None:
 def test_what_a_killed_packing_left_goes_with_the_next(tmp_path: Path) -> None:
     run = write(tmp_path / "run.zarr")
     code = (
-        "import os, signal, sys; from weighttraj.tools import pack as p; "
-        "p.sync = lambda _: os.kill(os.getpid(), signal.SIGKILL); p.pack(sys.argv[1])"
+        "import os, signal, sys; from weighttraj import atomic; "
+        "from weighttraj.tools.pack import pack; "
+        "atomic.sync = lambda _: os.kill(os.getpid(), signal.SIGKILL); pack(sys.argv[1])"
     )
     ended = subprocess.run([sys.executable, "-c", code, str(run.path)], check=False)
     assert ended.returncode == -signal.SIGKILL
     (left,) = tmp_path.glob(".*")
-    assert (left / "run.zip").exists()
+    assert (left / "run.zarr.zip").exists()
     with FileLock(left / "lock"):  # as another process does while it packs
         wt.pack(run.path)
         assert left.exists()

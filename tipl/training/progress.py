@@ -24,7 +24,6 @@ class TrainingBar(LoggedProgress):
             TimeRemainingColumn(),
             console=console,
             refresh_per_second=2,  # drawing takes time from the training
-            disable=console.quiet,
         )
         self._bar = self.add_task(
             "training", total=total, completed=start, speed=0.0, error=float("nan")

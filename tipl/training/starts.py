@@ -139,7 +139,7 @@ class StartsLearner(Learner[E]):
 
     def _gather(self, groups: Sequence[Sequence[wt.Run]], console: Console) -> E | None:
         columns = (TextColumn("reading runs"), BarColumn(), MofNCompleteColumn())
-        with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
+        with LoggedProgress(*columns, console=console) as progress:
             bar = progress.add_task("", total=sum(map(len, groups)))
             found = gather(
                 groups,

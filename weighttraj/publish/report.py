@@ -121,7 +121,7 @@ def _progress(console: Console | None) -> Progress:
         TimeRemainingColumn(),
         TextColumn("left"),
     )
-    return LoggedProgress(*columns, console=console or Console(quiet=True))
+    return LoggedProgress(*columns, console=console)
 
 
 def _page(source: Source, *, film: bool, seed: int, progress: Progress) -> str:

@@ -251,13 +251,12 @@ def _write(
     console: Console | None,
 ) -> Dataset:
     """Copy the runs beside the place, then rename: half a data set has a hidden name."""
-    console = console or Console(quiet=True)
     columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn())
     try:
         with appearing(out) as draft:
             (draft / "runs").mkdir(parents=True)
             entries = []
-            with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
+            with LoggedProgress(*columns, console=console) as progress:
                 for new, (run, part) in progress.track(chosen.items()):
                     entry = RunEntry(
                         id=new, path=f"runs/{new}.zarr{PACKED}", seed=run.info.seed, split=part

@@ -130,9 +130,9 @@ def download(
         if steps is None and arrays is None:
             chosen = {entry.path for entry in _entries(dataset)} if part else None
             wanted = [line for line in lines if chosen is None or _is_of(line, chosen)]
-            _fetch_all(store, at, wanted, draft, console or Console(quiet=True))
+            _fetch_all(store, at, wanted, draft, console)
         else:
-            _cut_all(dataset, draft, steps, arrays, console or Console(quiet=True))
+            _cut_all(dataset, draft, steps, arrays, console)
         if part:
             _list_part(dataset, draft, steps, arrays)
         else:
@@ -173,7 +173,7 @@ def download_folder(
     _require(set(needed) - {line.path for line in lines}, place)
     draft = target.with_name(f".{target.name}.download")
     with _kept(draft):
-        _fetch_all(store, place, lines, draft, console or Console(quiet=True))
+        _fetch_all(store, place, lines, draft, console)
         replace_file(draft / MANIFEST, manifest.content)
         draft.rename(target)
 
@@ -246,7 +246,11 @@ def _require(missing: Collection[str], place: RemotePath) -> None:
 
 
 def _fetch_all(
-    store: RemoteStore, at: RemotePath, lines: list[ManifestLine], draft: Path, console: Console
+    store: RemoteStore,
+    at: RemotePath,
+    lines: list[ManifestLine],
+    draft: Path,
+    console: Console | None,
 ) -> None:
     with _progress(console, sum(line.size for line in lines)) as (progress, task):
 
@@ -363,11 +367,11 @@ def _cut_all(
     draft: Path,
     steps: tuple[int, int] | None,
     arrays: Collection[str] | None,
-    console: Console,
+    console: Console | None,
 ) -> None:
     """Read a part of each run from where it is, and pack it here."""
     names = {run.id: f"runs/{run.id}.zarr{PACKED}" for run in dataset}
-    with LoggedProgress(console=console, disable=console.quiet) as progress:
+    with LoggedProgress(console=console) as progress:
         for run in progress.track(dataset.runs, description="runs"):
             target = draft / names[run.id]
             if not target.is_file():  # a packed run appears when it is whole
@@ -454,10 +458,10 @@ def _refuse_link(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def _progress(console: Console, total: int) -> Iterator[tuple[Progress, TaskID]]:
+def _progress(console: Console | None, total: int) -> Iterator[tuple[Progress, TaskID]]:
     columns = (TextColumn("download"), BarColumn(), DownloadColumn())
     speed = (TransferSpeedColumn(), TimeRemainingColumn())
-    with LoggedProgress(*columns, *speed, console=console, disable=console.quiet) as progress:
+    with LoggedProgress(*columns, *speed, console=console) as progress:
         yield progress, progress.add_task("download", total=total)
 
 

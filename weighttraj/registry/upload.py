@@ -75,7 +75,6 @@ def upload(
     dataset = open_dataset(here)
     folder = Path(dataset.path)
     _check(dataset, folder, despite_lint)
-    console = console or Console(quiet=True)
     if place.scheme == "hf":
         return _upload_to_hub(dataset, folder, place, private)
     if place.scheme in ("http", "https"):
@@ -186,7 +185,7 @@ def upload_folder(
         return
     lines = [line for line in read_manifest(folder) if line.path != last]
     claim = None if claimed else store.stat(CLAIM)
-    _send_all(store, folder, lines, claim and claim[1], console or Console(quiet=True))
+    _send_all(store, folder, lines, claim and claim[1], console)
     for name in dict.fromkeys((MANIFEST, last)):
         store.write(name, folder / name)
     store.delete(CLAIM)
@@ -197,11 +196,11 @@ def _send_all(
     folder: Path,
     lines: list[ManifestLine],
     since: datetime | None,
-    console: Console,
+    console: Console | None,
 ) -> None:
     """Write files that did not come since the claim; None: all, whatever lies there."""
     columns = (TextColumn("upload"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
+    with LoggedProgress(*columns, console=console) as progress:
         task = progress.add_task("upload", total=sum(line.size for line in lines))
 
         def send(line: ManifestLine) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weighttraj.atomic import drafting, sync
+from weighttraj.atomic import appearing
 from weighttraj.errors import FormatError
 from weighttraj.format.schema import AXES, Profile, RunInfo, arrays_of
 from weighttraj.remote.address import Place, RemotePath, here, new_path
@@ -135,9 +135,9 @@ def _write(source: RunStore, info: RunInfo, snapshots: slice, target: Path) -> N
         snapshots: which of the source's.
         target: the file.
     """
-    with drafting(target) as folder:
+    with appearing(target, replace=True) as draft:
         live = LiveStore.create(
-            folder / "run.zarr",
+            draft.with_name(f"{draft.name}.folder"),
             replace(info, n_committed=0, n_committed_iterations=0),
             {axis: info.committed(axis) for axis in AXES},
         )
@@ -148,11 +148,7 @@ def _write(source: RunStore, info: RunInfo, snapshots: slice, target: Path) -> N
                 some = slice(first + start, first + min(start + step, rows))
                 live.write(name, start, source.read(name, some))
         live.commit(info)
-        draft = folder / "run.zip"
         write_zip(draft, _members(live.path))
-        sync(draft)
-        draft.replace(target)
-    sync(target.parent)
 
 
 def copy_packed(path: Path, out: Path, run_id: str) -> None:
@@ -165,17 +161,11 @@ def copy_packed(path: Path, out: Path, run_id: str) -> None:
     """
     store, source = RunStore.open(path), ZipObjects(path)
     info = replace(store.info, run_id=run_id)
-    with drafting(out) as folder:
-        metadata = folder / "zarr.json"
+    with appearing(out, replace=True) as draft:
+        metadata = draft.with_name(f"{draft.name}.json")
         metadata.write_bytes(group_document(info, store.documents, store.tags, store.attributes))
-        draft = folder / "run.zip"
-        write_zip(
-            draft,
-            ((name, metadata if name == "zarr.json" else source) for name in source.names),
-        )
-        sync(draft)
-        draft.replace(out)
-    sync(out.parent)
+        members = ((n, metadata if n == "zarr.json" else source) for n in source.names)
+        write_zip(draft, members)
 
 
 def same_as_packed(path: Path) -> bool:

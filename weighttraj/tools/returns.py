@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weighttraj.atomic import drafting, sync
+from weighttraj.atomic import appearing
 from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.schema import AXES, RETURNS, Evaluation, RunInfo
 from weighttraj.remote.address import here
@@ -170,16 +170,12 @@ def _write_folder(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarra
 def _write_file(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]) -> None:
     """Write a packed run anew: with these returns, or with none."""
     path = Path(store.path)
-    with drafting(path) as folder:
-        live = _new_objects(folder / "run.zarr", store, info, values)
-        draft = folder / "run.zip"
+    with appearing(path, replace=True) as draft:
+        live = _new_objects(draft.with_name(f"{draft.name}.folder"), store, info, values)
         source = ZipObjects(path)
         kept = _kept(source, store.documents, live.documents)
         _copy(source, kept, live.path, draft)
         _compare(source, kept, RunStore.open(draft), values)
-        sync(draft)
-        draft.replace(path)
-    sync(path.parent)
 
 
 def _new_objects(

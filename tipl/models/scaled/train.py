@@ -129,7 +129,7 @@ def _measure_all(
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    with LoggedProgress(*columns, console=console, disable=console.quiet) as progress:
+    with LoggedProgress(*columns, console=console) as progress:
         return [
             parts.get(run.id, _source(settings, run), partial(_measure, along, run, config))
             for run in progress.track(runs)
