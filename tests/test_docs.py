@@ -121,6 +121,9 @@ def test_evaluate(reader: Path) -> None:
     names = run_page(DOCS / "evaluate.md", {"--quick": QUICKER, "--episodes 5": "--episodes 1"})
     assert names["after"] > names["before"] + 100
     assert "half-step" in names["results"].forecasters
+    board = Path("data/demo/leaderboard/leaderboard.md").read_text()
+    assert "| theirs | 1 | " in board
+    assert "| relex-50 | 2 | " in board
 
 
 def test_the_page_of_what_is_supported_says_what_was_tried(

@@ -43,6 +43,11 @@ COMMANDS = {
         "Evaluate forecasters on held-out runs beside persistence; write a report.",
         "tipl.commands.evaluate:evaluate",
     ),
+    "leaderboard": Command(
+        "Use",
+        "Compare forecasters over all tasks of several evaluations.",
+        "tipl.commands.leaderboard:leaderboard",
+    ),
     "check": Command(
         "Use",
         "Five tests that a causal forecaster should pass, as numbers.",

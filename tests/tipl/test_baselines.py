@@ -299,7 +299,7 @@ def test_names_are_stable(ladder: list[Forecaster]) -> None:
         ["persistence", "last-step"]
         + [f"trend-{window}" for window in (5, 20, 50, 200)]
         + [f"ema-{beta}" for beta in (0.9, 0.95, 0.98)]
-        + ["dmd"]
+        + ["dmd", "last-iteration", "lines-50", "relex-50", "pptb-4"]
     )
     fitted = (
         ["last-step-shrunk"]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,13 @@ from tipl import (
     train,
 )
 from tipl.checks.copies import run_like
+from tipl.cli import main
 from tipl.errors import EvaluateError
 from tipl.evaluation import measure
+from tipl.evaluation.leaderboard import leaderboard
 from tipl.evaluation.parts import Parts
 from tipl.evaluation.results import Results
+from tipl.evaluation.rows import read_rows
 from tipl.evaluation.starts import (
     Starts,
     _sample,
@@ -502,3 +506,85 @@ def test_runs_of_other_policies_are_refused(small_dataset: Path, tmp_path: Path)
 def test_equal_names_are_refused(model: Path, config: EvaluateConfig) -> None:
     with pytest.raises(EvaluateError, match="the same name"):
         evaluate([load(model), load(model)], config)
+
+
+# Forecasters of strangers
+
+
+class Stranger(Persistence):
+    """A forecaster that does something odd."""
+
+    def __init__(self, name: str, forecast: Callable[[np.ndarray], Any]) -> None:
+        object.__setattr__(self, "name", name)
+        object.__setattr__(self, "_change", forecast)
+
+    def forecast(self, run: wt.Run, starts: Sequence[int], horizons: Sequence[int]) -> Any:
+        return self._change(super().forecast(run, starts, horizons))  # type: ignore[attr-defined]
+
+
+def _raise(_: np.ndarray) -> None:
+    raise ZeroDivisionError("nothing to divide by")
+
+
+ODD: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
+    "raises": (_raise, "ZeroDivisionError: nothing to divide by"),
+    "nan": (lambda found: found * np.nan, "NaN from"),
+    "shape": (lambda found: found[:, :1], "float32 (start, horizon, param)"),
+    "nothing": (lambda found: None, "object"),
+}
+
+
+def test_a_forecaster_that_fails_is_named_and_the_others_go_on(
+    config: EvaluateConfig, tmp_path: Path
+) -> None:
+    odd = [Stranger(name, change) for name, (change, _) in ODD.items()]
+    config = replace(config, out=tmp_path / "out")
+    results = evaluate([*odd, load("trend-5")], config)
+    assert set(results.forecasters) == {"persistence", "trend-5"}
+    assert set(results.failed) == set(ODD)
+    for name, (_, what) in ODD.items():
+        assert what in results.failed[name]
+    rows = read_rows(config.out / "rows.csv")
+    assert {row.forecaster for row in rows} == {"persistence", "trend-5"}
+    with pytest.raises(EvaluateError, match="no forecaster could be evaluated"):
+        evaluate(odd[:1], replace(config, out=tmp_path / "other"))
+
+
+def test_rows_give_the_figures_of_the_results(
+    results: dict[str, Any], config: EvaluateConfig
+) -> None:
+    board = leaderboard(read_rows(config.out / "rows.csv"), resamples=10)
+    known = results["forecasters"]["tipl"]
+    figures = {
+        "skill": known["skill"]["ratio_of_sums"]["all"],
+        "function skill": known["function_skill"]["all"],
+        "gain": known["gain"]["held"],
+    }
+    scores = {(s.measure, s.horizon, s.forecaster): s.score.value for s in board.scores}
+    for kind, rows in figures.items():
+        for row in rows:
+            expected = row["value"]
+            if expected is not None:  # some gain: no training earned anything
+                expected = pytest.approx(expected, rel=1e-6)
+            assert scores.get((kind, row["h"], "tipl")) == expected
+    oracles = {row.forecaster for row in read_rows(config.out / "rows.csv") if row.oracle}
+    assert oracles == {"reconstruction-8"}
+
+
+def test_several_data_sets_become_one_leaderboard(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(data, other)
+    write_dataset_info(other, replace(read_dataset_info(other), id="other-v1"))
+    options = "--horizons 1 2 --learning-starts 0 --function-starts 0 --bootstrap 50"
+    call = ["tipl", "evaluate", "trend-5", "last-iteration", "--data", str(data), str(other)]
+    monkeypatch.setattr("sys.argv", [*call, *options.split(), "--out", str(tmp_path / "all")])
+    main()
+    board = ["tipl", "leaderboard", str(tmp_path / "all"), "--out", str(tmp_path / "board")]
+    monkeypatch.setattr("sys.argv", [*board, "--rival", "trend-5", "--bootstrap", "50"])
+    main()
+    assert "leaderboard: " in capsys.readouterr().out
+    text = (tmp_path / "board/leaderboard.md").read_text()
+    assert "| trend-5 | 2 | " in text
+    assert text.count("| persistence | 2 | 0.00 [0.00, 0.00] |") == 2

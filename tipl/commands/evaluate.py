@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -12,16 +12,19 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
+import weighttraj as wt
 from tipl.checks.model import check_model
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.results import Results, read_results, write_document
-from tipl.registry import load
+from tipl.evaluation.rows import trained_on
+from tipl.registry import folder_of, load
 from tipl.report import tables
 from tipl.report.markdown import insert_markdown
 from tipl.report.page import evaluate as evaluate_all
 from tipl.report.page import write_report
 from tipl.report.tables import cell, headline, label
 from tipl.report.verdict import verdict
+from weighttraj.errors import WeightTrajError
 from weighttraj.remote.address import here, new_path
 from weighttraj.terminal import Output, say
 
@@ -31,11 +34,18 @@ WIDE = 150
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateCommand(EvaluateConfig):
-    """Evaluate forecasters on held-out runs beside persistence, and write a report."""
+    """Evaluate forecasters on held-out runs beside persistence, and write a report.
+
+    Several data sets are evaluated one after another, each in a folder of its id below ``--out``;
+    ``tipl leaderboard`` compares forecasters over all of them.
+    """
 
     forecasters: tyro.conf.Positional[tuple[str, ...]] = ()
     """Folders of models and of fitted baselines; names of models of the zoo, or of baselines that
-    need no fit (``ema-0.95``, say); or classes, ``module:Class``."""
+    need no fit (``ema-0.95``, say); or classes, ``module:Class``. ``{data}`` in a name stands for
+    the id of the data set: ``data/results/{data}/gate``."""
+    data: tuple[str, ...]  # type: ignore[assignment]
+    """Data sets: paths or ids."""
     workers: int = 1
     """Number of processes; each has one thread and takes a run at a time."""
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
@@ -44,19 +54,46 @@ class EvaluateCommand(EvaluateConfig):
 
 def evaluate(args: EvaluateCommand) -> None:
     """Evaluate forecasters on held-out runs beside persistence, and write a report."""
-    console = Output()
     new_path(args.out)
-    forecasters = [load(name) for name in args.forecasters]
+    if len(args.data) == 1:
+        faults = _evaluate_on(args, args.data[0], args.out)
+    else:
+        faults = []
+        for data in args.data:
+            try:
+                faults += _evaluate_on(args, data, args.out / wt.open_dataset(data).info.id)
+            except (WeightTrajError, FileNotFoundError) as error:
+                faults.append(f"{data}: {error}")
+    for fault in faults:
+        Output(stderr=True).print(f"not evaluated: {escape(fault)}", soft_wrap=True)
+    if faults:
+        sys.exit(1)
+
+
+def _evaluate_on(args: EvaluateCommand, data: str, out: Path) -> list[str]:
+    """Evaluate on one data set, and return what could not be evaluated and why."""
+    console = Output()
+    dataset = wt.open_dataset(data)
+    names = [name.replace("{data}", dataset.info.id) for name in args.forecasters]
+    forecasters = [load(name) for name in names]
+    settings = {field.name: getattr(args, field.name) for field in fields(EvaluateConfig)}
+    config = EvaluateConfig(**settings | {"data": data, "out": out})
     results = evaluate_all(
-        forecasters, args, workers=args.workers, imports=args.imports, console=console
+        forecasters,
+        config,
+        workers=args.workers,
+        imports=args.imports,
+        console=console,
+        trained_on={
+            forecaster.name: trained_on(folder_of(name), dataset)
+            for name, forecaster in zip(names, forecasters, strict=True)
+        },
     )
     console.print(_table(results, console))
     say(verdict(results))
-    say(f"report: {args.out / 'report.html'}")
-    if results.left_out:
-        for run, why in results.left_out.items():
-            Output(stderr=True).print(f"not evaluated: run {run}: {escape(why)}", soft_wrap=True)
-        sys.exit(1)
+    say(f"report: {out / 'report.html'}")
+    faults = {f"run {run}": why for run, why in results.left_out.items()} | results.failed
+    return [f"{results.data}: {what}: {why}" for what, why in faults.items()]
 
 
 def check(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.measure import Measured, Task, function_starts, measure
 from tipl.evaluation.results import Results, StartCounts, write_document
 from tipl.evaluation.returns import MODES
+from tipl.evaluation.rows import Seen, data_fingerprint, rows_of, write_rows
 from tipl.evaluation.starts import starts_of
 from tipl.evaluation.summary import Summary
 from tipl.forecaster import Forecaster, check_forecaster
@@ -31,8 +32,13 @@ def evaluate_only(
     workers: int,
     imports: Sequence[str],
     console: Console,
+    trained_on: Mapping[str, Seen] | None = None,
 ) -> Results:
-    """Evaluate forecasters, and write ``results.json``; ``tipl.evaluate`` writes a page, too."""
+    """Evaluate forecasters, and write ``results.json`` and ``rows.csv``.
+
+    ``tipl.evaluate`` writes a page, too. ``trained_on`` says for names of forecasters what they
+    were trained on.
+    """
     config, everyone = config.bounded(), _everyone(forecasters)
     dataset = wt.open_dataset(config.data)
     runs, left_out = _whole_runs(dataset.split(config.split).runs, config)
@@ -42,6 +48,8 @@ def evaluate_only(
     starts_of(runs[0], config)  # refuses what is too short or has no returns before the work
     with engine_of(workers, imports=imports) as engine:
         measured = _measure(tasks, engine, console)
+    failed = {name: why for m in reversed(measured) for name, why in m.failed.items()}
+    everyone = _without_failed(everyone, failed)
     summary = Summary(measured, config, everyone[0].name)
     results = Results(
         data=dataset.info.id,
@@ -49,6 +57,7 @@ def evaluate_only(
         split=config.split,
         runs=tuple(run.id for run in runs),
         left_out=left_out,
+        failed=failed,
         env_steps_per_snapshot=_env_steps_of(runs[0]),
         horizons=config.horizons,
         return_horizons=config.return_horizons if config.learning_starts else (),
@@ -66,6 +75,17 @@ def evaluate_only(
         forecasters={forecaster.name: summary.of(forecaster) for forecaster in everyone},
         command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
     )
+    rows = rows_of(
+        measured,
+        config,
+        task=dataset.info.id,
+        fingerprint=data_fingerprint(runs),
+        persistence=everyone[0].name,
+        failed=failed,
+        trained_on=dict(trained_on or {}) | {everyone[0].name: "nothing"},
+        oracles=[forecaster.name for forecaster in everyone if forecaster.is_oracle],
+    )
+    write_rows(config.out / "rows.csv", rows)
     write_document(config.out / "results.json", results)
     return results
 
@@ -89,6 +109,21 @@ def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
             do="a model is named after its folder: rename one",
         )
     return everyone
+
+
+def _without_failed(
+    everyone: Sequence[Forecaster], failed: Mapping[str, str]
+) -> tuple[Forecaster, ...]:
+    """Return the forecasters that gave a forecast of every run."""
+    kept = tuple(forecaster for forecaster in everyone if forecaster.name not in failed)
+    if len(kept) == 1 < len(everyone):
+        raise EvaluateError(
+            "no forecaster could be evaluated",
+            expected="at least one beside persistence",
+            got="; ".join(failed.values()),
+            do="mend the forecasters",
+        )
+    return kept
 
 
 def _whole_runs(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from tipl.errors import ForecastError
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.parts import Arrays, Parts, run_source
 from tipl.evaluation.returns import FRESH, MODES, Player, forecast_returns, true_returns
@@ -57,6 +58,8 @@ class Measured:
     """``now``, ``later`` and ``fresh``; empty without returns."""
     returns: dict[str, Arrays]
     """``forecast`` by forecaster."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """Why a forecaster could not be evaluated."""
 
 
 def measure(task: Task, tell: Tell) -> Measured:
@@ -90,13 +93,18 @@ class _Measurement(contextlib.ExitStack):
         """Measure everything."""
         starts, config, forecasters = self._starts, self._config, self._task.forecasters
         chosen = function_starts(starts, config)
-        weights, functions = {}, {}
+        weights, functions, returns, failed = {}, {}, {}, {}
+        with_returns = config.learning_starts > 0
         for forecaster in forecasters:
             name = forecaster.name
-            weights[name] = self._errors("weights", forecaster, starts.weights, squared_errors)
-            if len(chosen):
-                functions[name] = self._errors("policies", forecaster, chosen, divergences)
-        with_returns = config.learning_starts > 0
+            try:
+                weights[name] = self._errors("weights", forecaster, starts.weights, squared_errors)
+                if len(chosen):
+                    functions[name] = self._errors("policies", forecaster, chosen, divergences)
+                if with_returns:
+                    returns[name] = self._returns(forecaster)
+            except ForecastError as error:
+                failed[name] = str(error)
         return Measured(
             run=self._run.id,
             starts=starts,
@@ -107,7 +115,8 @@ class _Measurement(contextlib.ExitStack):
             weights=weights,
             functions=functions,
             true=self._true() if with_returns else {},
-            returns={f.name: self._returns(f) for f in forecasters} if with_returns else {},
+            returns=returns,
+            failed=failed,
         )
 
     def _errors(

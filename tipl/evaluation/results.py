@@ -102,6 +102,8 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     """Ids of the runs that forecasters were evaluated on."""
     left_out: dict[str, str] = {}
     """Runs of the split that could not be evaluated on, and why."""
+    failed: dict[str, str] = {}
+    """Forecasters that could not be evaluated, and why."""
     env_steps_per_snapshot: float | None = None
     """Mean number of environment steps from one snapshot to the next; unset: not recorded."""
     horizons: tuple[int, ...]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from tipl.evaluation.parts import Arrays
-from tipl.evaluation.weights import Tick
+from tipl.evaluation.weights import Tick, forecast
 from tipl.forecaster import Forecaster
 from tipl.runs import weights_of
 from weighttraj import Run
@@ -103,7 +103,7 @@ def forecast_returns(
     Returns:
         ``forecast``: float64 (mode, start, horizon).
     """
-    weights = forecaster.forecast(run, starts.tolist(), list(horizons))
+    weights = forecast(forecaster, run, starts, horizons)
     at = np.repeat(starts, len(horizons))
     rows = (starts[:, None] + np.asarray(horizons)).ravel() if forecaster.is_oracle else at
     policies = load_policies(run, rows).with_weights(weights.reshape(len(at), -1))

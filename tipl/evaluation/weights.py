@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -9,11 +10,16 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from torch.distributions import Normal, kl_divergence
 
+from tipl.errors import ForecastError
 from tipl.evaluation.parts import Arrays
 from tipl.forecaster import Forecaster
 from tipl.runs import weights_of
 from weighttraj import Run
+from weighttraj.errors import WeightTrajError
 from weighttraj.policies import PolicyBatch, load_policies
+
+SLOWEST = 60
+"""Seconds that a forecast from one start may take."""
 
 MAX_BYTES = 2**27
 """Bytes of the forecasts of one chunk of starts."""
@@ -36,8 +42,8 @@ def squared_errors(
     """
     offsets = [param.offset for param in run.layout.params]
     parts = []
-    for chunk, forecast in _forecasts(forecaster, run, starts, horizons, run.layout.size):
-        error = forecast - _later(weights_of(run), chunk, horizons)
+    for chunk, found in _forecasts(forecaster, run, starts, horizons, run.layout.size):
+        error = found - _later(weights_of(run), chunk, horizons)
         np.square(error, out=error)
         parts.append(np.add.reduceat(error, offsets, axis=2, dtype=np.float64))
         tick(len(chunk))
@@ -62,14 +68,14 @@ def divergences(
     probes = run["probe/observations"]
     room = run.layout.size + 4 * probes.shape[1] * _widest(run)
     parts = []
-    for chunk, forecast in _forecasts(forecaster, run, starts, horizons, room):
+    for chunk, found in _forecasts(forecaster, run, starts, horizons, room):
         rows = (chunk[:, None] + np.asarray(horizons)).ravel()
         rollout = np.maximum(run.iteration[rows] - 1, 0)  # phi_0 precedes the first one
         seen, place = np.unique(rollout, return_inverse=True)
         inputs = np.asarray(probes[seen], np.float32)[place]  # (policy, observation, *obs)
         true = load_policies(run, rows)
-        other = true.with_weights(forecast.reshape(len(rows), -1))
-        parts.append(_divergence(true, other, inputs).reshape(forecast.shape[:2]))
+        other = true.with_weights(found.reshape(len(rows), -1))
+        parts.append(_divergence(true, other, inputs).reshape(found.shape[:2]))
         tick(len(chunk))
     return {"kl": np.concatenate(parts)}
 
@@ -94,7 +100,45 @@ def _forecasts(
     size = max(1, MAX_BYTES // (room * len(horizons) * 4))
     for first in range(0, len(starts), size):
         chunk = starts[first : first + size]
-        yield chunk, forecaster.forecast(run, chunk.tolist(), list(horizons))
+        yield chunk, forecast(forecaster, run, chunk, horizons)
+
+
+def forecast(
+    forecaster: Forecaster, run: Run, starts: Int[np.ndarray, " start"], horizons: Sequence[int]
+) -> Float32[np.ndarray, "start horizon param"]:
+    """Return a forecast of which one knows that it is one.
+
+    Raises:
+        ForecastError: the forecaster raised an error, gave another shape or NaN, or took more than
+            ``SLOWEST`` seconds for a start.
+    """
+    began = time.monotonic()
+    try:
+        found = np.asarray(forecaster.forecast(run, starts.tolist(), list(horizons)))
+    except WeightTrajError:
+        raise
+    except Exception as error:  # a stranger's forecaster may raise anything
+        raise _refused(forecaster, run, "an array", f"{type(error).__name__}: {error}") from error
+    shape = (len(starts), len(horizons), run.layout.size)
+    if found.shape != shape or found.dtype.kind != "f":
+        got = f"{found.dtype} {found.shape}"
+        raise _refused(forecaster, run, f"float32 (start, horizon, param) {shape}", got)
+    if np.isnan(found).any():
+        bad = starts[np.isnan(found).any((1, 2))]
+        raise _refused(forecaster, run, "numbers", f"NaN from {len(bad)} starts, first {bad[0]}")
+    if (each := (time.monotonic() - began) / len(starts)) > SLOWEST:
+        raise _refused(forecaster, run, f"at most {SLOWEST} s for a start", f"{each:.0f} s")
+    return found.astype(np.float32, copy=False)
+
+
+def _refused(forecaster: Forecaster, run: Run, expected: str, got: str) -> ForecastError:
+    return ForecastError(
+        f"{forecaster.name} gives no forecast",
+        expected=expected,
+        got=got,
+        where=f"run {run.id}",
+        do="mend the forecaster, or leave it out",
+    )
 
 
 def _later(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jinja2
@@ -11,6 +11,7 @@ from rich.console import Console
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.evaluate import evaluate_only
 from tipl.evaluation.results import Results
+from tipl.evaluation.rows import Seen
 from tipl.forecaster import Forecaster
 from tipl.report.figures import figures, file_name, svg
 from tipl.report.tables import cell, headline, label, tables
@@ -24,6 +25,7 @@ def evaluate(
     workers: int = 1,
     imports: Sequence[str] = (),
     console: Console | None = None,
+    trained_on: Mapping[str, Seen] | None = None,
 ) -> Results:
     """Evaluate forecasters beside persistence; write ``results.json``, a page and figures.
 
@@ -36,6 +38,8 @@ def evaluate(
         workers: number of processes; 1 means this one.
         imports: modules that register environments; every worker imports them.
         console: where progress is shown; None: nowhere.
+        trained_on: what forecasters were trained on, by name: runs of this data set, of others,
+            or nothing; it stands in ``rows.csv``.
 
     Returns:
         What ``results.json`` holds.
@@ -45,7 +49,9 @@ def evaluate(
             forecasters have one name.
         KeyboardInterrupt: it was stopped; the measurements stay.
     """
-    results = evaluate_only(forecasters, config, workers, imports, console or Console(quiet=True))
+    results = evaluate_only(
+        forecasters, config, workers, imports, console or Console(quiet=True), trained_on
+    )
     write_report(results, config.out)
     return results
 

@@ -6,6 +6,10 @@
 | ``last-step`` | repeats the last step |
 | ``trend-5``, ``-20``, ``-50``, ``-200`` | goes on along a line through the last snapshots |
 | ``ema-0.9``, ``-0.95``, ``-0.98`` | repeats a mean of steps |
+| ``last-iteration`` | repeats the change of the last PPO iteration |
+| ``lines-50`` | a line for each weight, where a line fits (Linearity) |
+| ``relex-50`` | one direction for each tensor, and a line along it (RELEX) |
+| ``pptb-4`` | the last iteration's change along the leading directions of the path (PPTB) |
 | ``dmd`` | a linear operator on the last steps, of low rank |
 | ``last-step-shrunk``, ``ema-...-shrunk`` | the same times a fitted factor for each horizon |
 | ``ar-20``, ``ar-20-phase`` | regression on 20 steps; by part of the PPO iteration |

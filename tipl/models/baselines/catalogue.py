@@ -10,11 +10,24 @@ import msgspec
 
 from tipl.models.baselines.features import Ema, EndPoints, Features, Slope, Steps
 from tipl.models.baselines.modes import ModeSteps
+from tipl.models.baselines.rivals import LastIteration, LeadingDirections, Lines, Relex
 from tipl.models.baselines.subspace import ProjectedSteps
 from tipl.saved import broken
 
 KINDS: dict[str, type[Features]] = {
-    cls.kind: cls for cls in (Steps, Slope, Ema, ProjectedSteps, ModeSteps, EndPoints)
+    cls.kind: cls
+    for cls in (
+        Steps,
+        Slope,
+        Ema,
+        LastIteration,
+        Lines,
+        Relex,
+        LeadingDirections,
+        ProjectedSteps,
+        ModeSteps,
+        EndPoints,
+    )
 }
 
 
