@@ -412,7 +412,7 @@ def _repair(path: Positional[str], cut: bool = False) -> None:
 
     Args:
         path: Data set (path or id) or run.
-        cut: Drop damaged snapshots and those after them; collecting again makes them anew.
+        cut: Drop damaged snapshots and those after them; collecting again restores them.
     """
     place = locate(path)
     for step in wt.repair(place, cut=cut):
@@ -536,7 +536,7 @@ def _cache(clear: bool = False) -> None:
 
 
 def _state_of(path: Path) -> str:
-    """What remains to be said of something whole: it may not be finished."""
+    """Return what remains to be said of something whole: it may not be finished."""
     if not (path / "dataset.json").is_file():
         info = wt.open_run(path).info
         if info.status == "complete":

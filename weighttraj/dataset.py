@@ -46,13 +46,13 @@ class Dataset:
         return Dataset(self.path, self.info, runs)
 
     def select(self, **wanted: Any) -> Dataset:
-        """The runs that fit every condition.
+        """Return the runs that fit every condition.
 
         Args:
             wanted: ``env``, ``algorithm``, ``seed``, ``split``, ``status``, ``id``,
                 ``final_return``, ``final_mean_return`` or a hyper-parameter such as
                 ``learning_rate``, each with the value it must have, a collection it must be in,
-                or a function that says whether a value will do. A run without it does not fit.
+                or a function that says whether a value fits. A run without it does not fit.
 
         >>> ds.select(env="InvertedPendulum-v4", seed=range(10))  # doctest: +SKIP
         >>> ds.select(final_return=lambda value: value > 900, n_epochs=10)  # doctest: +SKIP
@@ -85,7 +85,7 @@ class Dataset:
         fields: Sequence[str] = ("weights",),
         evaluated: bool = False,
     ) -> WindowDataset:
-        """Windows of consecutive snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
+        """Return windows of consecutive snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
 
         Args:
             window: snapshots in a window.
@@ -107,7 +107,7 @@ class Dataset:
         fields: Sequence[str] = ("weights",),
         evaluated: bool = False,
     ) -> SnapshotDataset:
-        """Single snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
+        """Return single snapshots as a torch ``Dataset``. Needs the extra ``sb3``.
 
         Arguments are those of ``to_torch``.
         """
@@ -165,7 +165,7 @@ def _hyperparameters(run: Run) -> dict[str, Any]:
 
 
 def _has(run: Run, name: str, wanted: Any) -> bool:
-    """Whether a run has a property that fits."""
+    """Return whether a run has a property that fits."""
     if name in _FACTS:
         return _fits(_FACTS[name](run), wanted)
     values = _hyperparameters(run)

@@ -105,7 +105,7 @@ def distance(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _mean_returns(run: Run, *, deterministic: bool) -> np.ndarray:
-    """Mean return of each snapshot over the episodes of a mode; NaN where there is none."""
+    """Return the mean return of each snapshot over episodes of a mode; NaN where there is none."""
     if run.evaluation is None or deterministic not in run.evaluation.deterministic:
         return np.full(len(run), np.nan)
     return run.mean_return(deterministic)

@@ -59,7 +59,7 @@ def is_run(path: Path) -> bool:
 
 
 def folders() -> list[Path]:
-    """Folders in which data sets are looked for, the first one first."""
+    """Return folders in which data sets are looked for, the first one first."""
     named = [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
     own = clone()
     return [*map(_expanded, named or _home()), *([own] if own else []), Path(COLLECTED)]

@@ -118,7 +118,7 @@ def _open_folder(path: Path) -> Dataset:
 
 
 def _open_remote(place: RemotePath) -> Dataset:
-    """The data set at an address; its runs are opened when they are first used."""
+    """Return the data set at an address; its runs are opened when they are first used."""
     from weighttraj.remote.hub import pinned
     from weighttraj.remote.store import store_at
 

@@ -52,7 +52,7 @@ class ArrayStore(Protocol):
         """Read part of an array, within the committed rows; raises DamageError."""
 
     def chunk_rows(self, name: str) -> int:
-        """Rows of an array that are decoded together."""
+        """Return rows of an array that are decoded together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +238,7 @@ class Run:
         return {name: StoredArray(self._store, spec) for name, spec in self._store.specs.items()}
 
     def __getitem__(self, name: str) -> StoredArray:
-        """Any array by name, such as ``train/approx_kl``; ``run.arrays`` lists them."""
+        """Return any array by name, such as ``train/approx_kl``; ``run.arrays`` lists them."""
         try:
             return StoredArray(self._store, self._store.specs[name])
         except KeyError:
@@ -246,15 +246,15 @@ class Run:
             raise KeyError(f"run {self.id} stores no {name!r}; it stores {names}") from None
 
     def __len__(self) -> int:
-        """Number of committed snapshots."""
+        """Return the number of committed snapshots."""
         return self.info.n_committed
 
     def keys(self) -> list[str]:
-        """Names of all arrays."""
+        """Return names of all arrays."""
         return list(self._store.specs)
 
     def at(self, num_timesteps: int) -> int:
-        """The last snapshot taken at or before so many environment steps.
+        """Return the last snapshot taken at or before so many environment steps.
 
         >>> run.at(num_timesteps=100_000)  # doctest: +SKIP
         240
@@ -295,7 +295,7 @@ class Run:
         return self[RETURNS[0]]
 
     def mean_return(self, deterministic: bool = True) -> Float64[np.ndarray, " time"]:
-        """Mean return of each snapshot over the episodes of one mode.
+        """Return the mean return of each snapshot over the episodes of one mode.
 
         NaN: the snapshot was not evaluated, or an episode has no return.
 
@@ -323,11 +323,11 @@ class Run:
         return float(self.mean_return(mode)[rows[-1]]) if rows.size else float("nan")
 
     def obs_norm(self, t: int) -> NormStats | None:
-        """Statistics of the observation normaliser at snapshot t; None: the run has none."""
+        """Return statistics of the observation normaliser at snapshot t; None: the run has none."""
         return self._stats("obs_norm", t) if self.info.obs_norm is not None else None
 
     def ret_norm(self, t: int) -> NormStats | None:
-        """Statistics of the reward normaliser at snapshot t; None: the run has none."""
+        """Return statistics of the reward normaliser at snapshot t; None: the run has none."""
         return self._stats("ret_norm", t) if self.info.ret_norm else None
 
     def to_pandas(self) -> pd.DataFrame:
@@ -346,7 +346,7 @@ class Run:
         return frames.run_dataset(self)
 
     def load_policy(self, t: int = -1) -> Policy:
-        """The policy of snapshot t, which acts as the agent did. Needs the extra ``sb3``.
+        """Return the policy of snapshot t, which acts as the agent did. Needs the extra ``sb3``.
 
         Args:
             t: snapshot, from 0; below 0 it counts from the end.
@@ -401,7 +401,7 @@ class Run:
         return self.evaluation
 
     def _episodes(self, deterministic: bool) -> list[int]:
-        """Columns of the episodes of one mode."""
+        """Return columns of the episodes of one mode."""
         modes = self._evaluated().deterministic
         columns = [i for i, mode in enumerate(modes) if mode == deterministic]
         if not columns:
@@ -429,7 +429,7 @@ class Run:
 
 
 def _rows(key: Any, n: int, where: str) -> Any:
-    """A row selection with non-negative bounds inside the committed rows."""
+    """Return a row selection with non-negative bounds inside the committed rows."""
     if isinstance(key, slice):
         start, stop, step = key.indices(n)
         if step < 1:

@@ -250,7 +250,7 @@ class RunWriter:
             )
 
     def _tail(self, axis: Axis) -> _Block:
-        """The last, partly filled block: it will be written again as a whole."""
+        """Return the last, partly filled block: it will be written again as a whole."""
         n = self._store.info.committed(axis)
         first = n // self._store.info.block * self._store.info.block
         tail = {s.name: self._store.read(s.name, slice(first, n)) for s in self._specs[axis]}
@@ -307,7 +307,7 @@ _MAY_DIFFER = (
 
 
 def explain_difference(stored: Provenance, now: Provenance) -> str:
-    """What about two trainings could make them differ in bits, in words.
+    """Return what about two trainings could make them differ in bits, in words.
 
     >>> explain_difference(Provenance(threads=1), Provenance(threads=4))
     'in other circumstances: threads 1, now 4'

@@ -138,7 +138,7 @@ def describe_run(
 
 
 def describe_layout(parameters: dict[str, nn.Parameter], policy: PolicySpec) -> ParamLayout:
-    """Order, shape, role and symmetry of the parameters."""
+    """Return the order, shape, role and symmetry of the parameters."""
     axes: dict[str, tuple[str, ...]] = {}
     for i, (weight, bias) in enumerate(policy.layers):
         inputs = "observation" if i == 0 else f"hidden_{i - 1}"
@@ -220,7 +220,7 @@ def _parts(network: Any) -> tuple[Acting, nn.Sequential, str, str, tuple[str, ..
 def describe_policy(
     policy: ActorCriticPolicy, unknown_wrappers: tuple[str, ...], more: Sequence[str] = ()
 ) -> PolicySpec:
-    """What it takes to rebuild the policy, or the reasons why it cannot be.
+    """Return what it takes to rebuild the policy, or the reasons why it cannot be.
 
     A description without reasons is proven: the policy that is rebuilt from it acts as this one.
 
@@ -240,13 +240,13 @@ def describe_policy(
 
 
 def _changing(wrappers: tuple[str, ...]) -> list[str]:
-    """Reasons why a policy cannot act outside its wrappers."""
+    """Return reasons why a policy cannot act outside its wrappers."""
     change = "which may change observations or actions"
     return [f"environment wrapper {name}, {change}" for name in wrappers]
 
 
 def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
-    """The policy as a multilayer perceptron, and the reasons why it is certainly none."""
+    """Return the policy as a multilayer perceptron, and the reasons why it is certainly none."""
     space = policy.observation_space
     layers, activation, reasons = _mlp(policy)
     head, odd = describe_head(policy.action_space)
@@ -271,7 +271,7 @@ def _network(policy: ActorCriticPolicy) -> tuple[PolicySpec, list[str]]:
 
 
 def _odd_observations(space: spaces.Space[Any]) -> list[str]:
-    """Reasons why a multilayer perceptron does not see the observations as they are."""
+    """Return reasons why a multilayer perceptron does not see the observations as they are."""
     reasons = []
     if not isinstance(space, spaces.Box):
         reasons.append(f"observations in a {type(space).__name__} space")
@@ -281,7 +281,7 @@ def _odd_observations(space: spaces.Space[Any]) -> list[str]:
 
 
 def _other_parameters(parameters: dict[str, nn.Parameter], wanted: set[str]) -> list[str]:
-    """Reasons why the parameters are not those of a multilayer perceptron."""
+    """Return reasons why the parameters are not those of a multilayer perceptron."""
     reasons = []
     if more := sorted(parameters.keys() - wanted):
         reasons.append(f"parameters that no multilayer perceptron has: {_few(more)}")
@@ -316,7 +316,7 @@ def describe_head(space: spaces.Space[Any]) -> tuple[dict[str, Any], list[str]]:
 
 
 def describe_algorithm(agent: Agent, collector: str = "") -> Algorithm:
-    """Name and hyper-parameters; schedules become tables over the progress that remains.
+    """Return the name and hyper-parameters; schedules become tables over the progress that remains.
 
     Args:
         agent: what is trained.
@@ -357,7 +357,7 @@ def _steps_of_an_update(model: BaseAlgorithm) -> int | None:
 
 
 def describe_provenance() -> Provenance:
-    """Versions, machine and command of this process."""
+    """Return versions, machine and command of this process."""
     packages = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -376,7 +376,7 @@ def describe_provenance() -> Provenance:
 
 
 def _mlp(policy: ActorCriticPolicy) -> tuple[tuple[tuple[str, str], ...], str, list[str]]:
-    """Layer names, activation, and reasons why this is no plain MLP."""
+    """Return layer names, activation, and reasons why this is no plain MLP."""
     reasons = _surroundings(policy)
     net = getattr(getattr(policy, "mlp_extractor", None), "policy_net", None)
     if not isinstance(net, nn.Sequential) or not isinstance(policy.action_net, nn.Linear):
@@ -419,7 +419,7 @@ def _role(name: str) -> Role:
 
 
 def _plain(value: Any) -> Any:
-    """The nearest JSON value: code is named, never stored."""
+    """Return the nearest JSON value: code is named, never stored."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

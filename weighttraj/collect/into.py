@@ -165,7 +165,7 @@ def _no_statistics(run: Run, got: str) -> PolicyError:
 
 
 def _normalizes(env: VecEnv) -> bool:
-    """Whether observations are normalised, also by a class that is not known."""
+    """Return whether observations are normalised, also by a class that is not known."""
     vec: Any = env
     while hasattr(vec, "venv"):
         if isinstance(vec, VecNormalize) and vec.norm_obs:

@@ -40,7 +40,7 @@ class Rollout:
     """Advantages plus values, (learner, step)."""
 
     def __getitem__(self, learners: slice) -> Rollout:
-        """The part of some of the learners."""
+        """Return the part of some of the learners."""
         return Rollout(**{name: tensor[learners] for name, tensor in vars(self).items()})
 
 
@@ -70,13 +70,13 @@ class Learners:
         )
 
     def moments(self, name: str) -> Tensor:
-        """Adam's ``exp_avg`` or ``exp_avg_sq``, (learner, column of the stack)."""
+        """Return Adam's ``exp_avg`` or ``exp_avg_sq``, (learner, column of the stack)."""
         (parameter,) = self.optimizer.param_groups[0]["params"]
         state: dict[str, Tensor] = self.optimizer.state[parameter]
         return state.get(name, torch.zeros_like(self._stack.values))
 
     def estimate(self, observations: Tensor) -> Tensor:
-        """The critic's values (learner, step) for network inputs (learner, step, obs)."""
+        """Return the critic's values (learner, step) for network inputs (learner, step, obs)."""
         parts = observations.chunk(observations.shape[1] // self._config.batch_size, dim=1)
         return torch.cat([self._critic.forward(part)[..., 0].clone() for part in parts], dim=1)
 
@@ -190,13 +190,13 @@ def _surrogates(log_ratio: Tensor, advantages: Tensor, clip: float) -> tuple[Ten
 
 
 def _value_change(values: Tensor, old: Tensor, clip: float | None) -> tuple[Tensor, Tensor]:
-    """How far values have moved from the old ones, and how far the loss lets them."""
+    """Return how far values have moved from the old ones, and how far the loss lets them."""
     change = values - old
     return change, change if clip is None else change.clamp(-clip, clip)
 
 
 def _losses(epoch: _Epoch, config: PPOConfig) -> dict[str, np.ndarray]:
-    """What SB3 logs of each minibatch, float64 (learner, minibatch)."""
+    """Return what SB3 logs of each minibatch, float64 (learner, minibatch)."""
     log_ratio = epoch.now_log_probs - epoch.log_probs
     ratio = log_ratio.exp()
     surrogates = _surrogates(log_ratio, epoch.advantages, config.clip_range)
@@ -215,7 +215,7 @@ def _losses(epoch: _Epoch, config: PPOConfig) -> dict[str, np.ndarray]:
 def _diagnostics(
     history: list[dict[str, np.ndarray]], rollout: Rollout, learner: int
 ) -> dict[str, float]:
-    """One learner's figures of an update, as SB3 sums them up."""
+    """Return one learner's figures of an update, as SB3 sums them up."""
     figures = {
         name: float(np.concatenate([epoch[name][learner] for epoch in history]).mean())
         for name in history[0]

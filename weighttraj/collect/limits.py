@@ -172,7 +172,7 @@ def _environment_problems(config: PPOConfig, population: bool) -> Iterator[Probl
 
 
 def _misfit(env: gym.Env[Any, Any], config: PPOConfig, population: bool) -> str:
-    """Return what the environment should be and is not; empty: it will do."""
+    """Return what the environment should be and is not; empty: it fits."""
     seen, done = env.observation_space, env.action_space
     if population and kernel_for(env) is None:
         return (
@@ -213,7 +213,7 @@ def _problem(key: str, expected: str, value: Any) -> Problem:
 
 
 def _text(value: Any) -> str:
-    """A value in a line, shortened."""
+    """Return a value in a line, shortened."""
     if isinstance(value, str):
         return value if len(value) <= _MOST_LETTERS else f"{value[:_MOST_LETTERS]}..."
     return str(value) if isinstance(value, float) else reprlib.repr(value)

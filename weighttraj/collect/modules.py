@@ -18,7 +18,7 @@ def describe_mlp(
     observation_space: spaces.Space[object],
     action_space: spaces.Space[object],
 ) -> tuple[ParamLayout, PolicySpec]:
-    """Layout and structure of a policy that is a plain multilayer perceptron.
+    """Return the layout and structure of a policy that is a plain multilayer perceptron.
 
     With both in ``RunInfo`` a run's policies can be rebuilt and evaluated: ``run.load_policy(t)``.
     The names are those of ``actor.state_dict()``; continuous actions are Gaussian, with one more
@@ -85,7 +85,7 @@ def describe_mlp(
 def _misfit_of_choices(
     policy: PolicySpec, layout: ParamLayout, action_space: spaces.Space[object]
 ) -> str:
-    """Why the last layer does not choose among the actions; empty: it does."""
+    """Return why the last layer does not choose among the actions; empty: it does."""
     last = policy.layers[-1][1]
     if not isinstance(action_space, spaces.Discrete) or layout[last].size == action_space.n:
         return ""

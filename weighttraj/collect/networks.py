@@ -44,22 +44,22 @@ class Stack:
         return len(self.values)
 
     def __getitem__(self, learners: slice) -> Stack:
-        """Some of the learners, in the same memory."""
+        """Return some of the learners, in the same memory."""
         part = object.__new__(Stack)
         part.shapes, part._offsets = self.shapes, self._offsets
         part.values, part.gradients = self.values[learners], self.gradients[learners]
         return part
 
     def value(self, name: str) -> Tensor:
-        """A parameter of all learners, (learner, *shape)."""
+        """Return a parameter of all learners, (learner, *shape)."""
         return self._view(self.values, name)
 
     def gradient(self, name: str) -> Tensor:
-        """The gradient of a parameter of all learners, (learner, *shape)."""
+        """Return the gradient of a parameter of all learners, (learner, *shape)."""
         return self._view(self.gradients, name)
 
     def places(self, names: Sequence[str]) -> np.ndarray:
-        """Columns of some parameters, one after the other."""
+        """Return columns of some parameters, one after the other."""
         offsets, shapes = self._offsets, self.shapes
         ranges = [np.arange(offsets[n], offsets[n] + shapes[n].numel()) for n in names]
         return np.concatenate(ranges)
@@ -89,7 +89,7 @@ class MLP:
     """A network of each learner of a stack, with buffers for one batch size.
 
     The gradient is written out: with buffers that are kept, and products that write into the stack,
-    it takes two thirds of the time of autograd, which allocates each intermediate anew.
+    it takes two thirds of the time of autograd, which allocates each intermediate again.
 
     Args:
         stack: where the parameters are.
@@ -115,7 +115,7 @@ class MLP:
         self._activate, self._activation_gradient = _ACTIVATIONS[activation]
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Outputs (learner, sample, out), in a buffer that the next call writes again.
+        """Return outputs (learner, sample, out), in a buffer that the next call writes again.
 
         Args:
             inputs: (learner, sample, in).

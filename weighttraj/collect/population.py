@@ -41,7 +41,7 @@ _LOG_SQRT_2PI = np.float32(0.5 * np.log(2 * np.pi))
 
 @runtime_checkable
 class Watcher(Protocol):
-    """Who follows one learner: see ``Recorder``."""
+    """What is told of one learner's training: see ``Recorder``."""
 
     def end_rollout(self, returns: Sequence[Any], inputs: np.ndarray) -> None:
         """A rollout is there."""
@@ -108,7 +108,7 @@ class Population:
         """Environment steps of each learner so far."""
 
     def read(self, learner: int, *, critic: bool = False, moments: bool = False) -> Reading:
-        """What a learner is now.
+        """Return what a learner is now.
 
         Args:
             learner: which.
@@ -204,7 +204,7 @@ class Population:
         rewards[cut] += np.float32(self._config.gamma) * values[cut]
 
     def _judge_each(self, inputs: np.ndarray) -> Tensor:
-        """The critic's values (learner, 1, 1) of one input each, (learner, obs)."""
+        """Return the critic's values (learner, 1, 1) of one input each, (learner, obs)."""
         return self._judge.forward(torch.from_numpy(inputs)[:, None])
 
     def _draw_noise(self) -> np.ndarray:
@@ -214,7 +214,7 @@ class Population:
         return noise.numpy()
 
     def _permutations(self) -> np.ndarray:
-        """Order of the samples as SB3's buffer draws it, (epoch, learner, step)."""
+        """Return the order of the samples as SB3's buffer draws it, (epoch, learner, step)."""
         epochs, steps = range(self._config.n_epochs), self._config.n_steps
         orders = [[state.permutation(steps) for _ in epochs] for state in self._shuffle]
         return np.array(orders).swapaxes(0, 1)
@@ -229,7 +229,7 @@ class Population:
 
 
 def origins_of(config: PPOConfig, seeds: Sequence[int]) -> list[Origin]:
-    """Where the learners of some seeds begin; a lone one comes twice, see ``Population``."""
+    """Return where the learners of some seeds begin; a lone one comes twice, see ``Population``."""
     return [Origin(config, seed) for seed in (seeds if len(seeds) > 1 else [*seeds, *seeds])]
 
 
@@ -269,7 +269,7 @@ def _after_step(watchers: Sequence[Watcher]) -> Callable[[], None]:
 
 
 def _stack(origins: Sequence[Origin]) -> Stack:
-    """The initial parameters of all learners."""
+    """Return the initial parameters of all learners."""
     parameters = [dict(origin.model.policy.named_parameters()) for origin in origins]
     stack = Stack({name: p.shape for name, p in parameters[0].items()}, len(origins))
     for i, named in enumerate(parameters):
@@ -279,7 +279,7 @@ def _stack(origins: Sequence[Origin]) -> Stack:
 
 
 def _layers(names: Sequence[str]) -> list[str]:
-    """Prefixes of the layers among some parameters, first layer first."""
+    """Return prefixes of the layers among some parameters, first layer first."""
     return [name.removesuffix(".weight") for name in names if name.endswith(".weight")]
 
 
@@ -291,7 +291,7 @@ def _groups(learners: int, width: int) -> list[slice]:
 
 
 def _log_probs(actions: np.ndarray, means: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Log-densities of actions, summed over their dimensions, float32 (step, learner)."""
+    """Return log-densities of actions, summed over their dimensions, float32 (step, learner)."""
     squares = np.square(actions - means) / (2 * np.square(std))
     return np.asarray((-squares - np.log(std) - _LOG_SQRT_2PI).sum(-1))
 

@@ -109,7 +109,7 @@ class PPOConfig:
 
 
 def make_env(config: PPOConfig) -> gym.Env[Any, Any]:
-    """One environment with CleanRL's wrappers."""
+    """Make one environment with CleanRL's wrappers."""
     env = environments.make(config.env_id)
     if config.normalization == "gymnasium":
         env = gym.wrappers.RecordEpisodeStatistics(env)
@@ -121,7 +121,7 @@ def make_env(config: PPOConfig) -> gym.Env[Any, Any]:
 
 
 def make_vec_env(config: PPOConfig) -> VecEnv:
-    """The same as SB3 takes it: one environment, vectorised."""
+    """Make the same environment as SB3 takes it: one environment, vectorised."""
     env: VecEnv = DummyVecEnv([lambda: make_env(config)])
     if config.normalization == "gymnasium":
         return env
@@ -130,7 +130,7 @@ def make_vec_env(config: PPOConfig) -> VecEnv:
 
 
 def make_ppo(config: PPOConfig, *, seed: int) -> PPO:
-    """SB3's PPO for a configuration. Train it with ``learn(n_iterations * n_steps)``.
+    """Make SB3's PPO for a configuration. Train it with ``learn(n_iterations * n_steps)``.
 
     Raises:
         CollectError: the environment is unknown, or the settings leave no iteration.

@@ -136,7 +136,7 @@ def acts_with(policy: BasePolicy, names: Sequence[str]) -> bool:
 
 
 def _predictions(policy: BasePolicy, observations: Sequence[Any]) -> list[np.ndarray]:
-    """Deterministic and sampled actions."""
+    """Return deterministic and sampled actions."""
     torch.manual_seed(0)
     return [
         np.asarray(policy.predict(observation, deterministic=deterministic)[0])
@@ -154,12 +154,12 @@ def _randomise(module: nn.Module, scale: float | None) -> None:
 
 
 def _rebuild(spec: PolicySpec, layout: ParamLayout, named: Mapping[str, Tensor]) -> Policy:
-    """The policy as it is rebuilt from what a run stores."""
+    """Return the policy as it is rebuilt from what a run stores."""
     return Policy(spec, layout, layout.flatten({p.name: named[p.name] for p in layout.params}))
 
 
 def _copy(policy: PolicyT) -> PolicyT:
-    """A copy on the CPU, without optimizers, whose hooks may lead to the whole training."""
+    """Return a copy on the CPU, without optimizers, whose hooks may lead to the whole training."""
     memo: dict[int, Any] = {}
     for module in policy.modules():
         for value in vars(module).values():
@@ -300,7 +300,7 @@ def _rolled(
 
 
 def _observations(space: spaces.Space[np.ndarray]) -> np.ndarray:
-    """Some that the policy may meet, of all sizes, (observation, *obs)."""
+    """Return observations that the policy may meet, of all sizes, (observation, *obs)."""
     rng = np.random.default_rng(0)
     if not isinstance(space, spaces.Box):
         raise TypeError(f"observations in a {type(space).__name__} space")
@@ -314,13 +314,13 @@ def _observations(space: spaces.Space[np.ndarray]) -> np.ndarray:
 
 
 def _wide(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Normal numbers of all sizes, (observation, *obs)."""
+    """Return normal numbers of all sizes, (observation, *obs)."""
     sizes = np.logspace(-3, 3, _OBSERVATIONS).reshape(-1, *(1 for _ in shape))
     return rng.standard_normal((_OBSERVATIONS, *shape)) * sizes
 
 
 def _numpy(distribution: object, name: str) -> np.ndarray:
-    """A parameter of a distribution, or nothing if it has none or is of another kind."""
+    """Return a parameter of a distribution, or nothing if it has none or is of another kind."""
     if type(distribution) not in (Normal, Categorical):
         raise TypeError(f"its actions have the distribution {type(distribution).__name__}")
     value: Tensor = getattr(distribution, name)
@@ -339,6 +339,6 @@ def _distance(got: np.ndarray, expected: np.ndarray) -> str:
 
 
 def _line(error: Exception) -> str:
-    """The first line of an error."""
+    """Return the first line of an error."""
     text = error.message if isinstance(error, WeightTrajError) else str(error)
     return f"{type(error).__name__}: {(text.splitlines() or [''])[0]}"[:200]

@@ -60,7 +60,7 @@ class Environments:
         return self.normalizer.inputs
 
     def step(self, actions: np.ndarray) -> np.ndarray:
-        """Step every environment; those that end begin anew.
+        """Step every environment; those that end begin again.
 
         Args:
             actions: float32 (learner, action); clipped here, as SB3 clips them.
@@ -81,7 +81,7 @@ class Environments:
         return self.normalizer.scale(step.rewards, step.terminated, self.starting)
 
     def last_inputs(self) -> np.ndarray:
-        """What the agents would see now if no episode had ended, float32 (learner, obs)."""
+        """Return what the agents would see now if no episode had ended, float32 (learner, obs)."""
         inputs = self.normalizer.inputs.copy()
         inputs[self.starting] = self.normalizer.last_inputs
         return inputs
@@ -109,7 +109,7 @@ class Environments:
 
 
 def check_kernel(env: gym.Env[Any, Any], env_id: str) -> Kernel:
-    """The batched physics of an environment.
+    """Return the batched physics of an environment.
 
     Raises:
         CollectError: it has none.

@@ -220,7 +220,7 @@ def _progress(tasks: list[Task], console: Console) -> Iterator[Report]:
 def _plan(
     recipe: Recipe, out: Path, entries: list[RunEntry], console: Console
 ) -> tuple[list[Task], list[Failure]]:
-    """Runs that are still to be made, and those that cannot be read."""
+    """Return runs that are still to be made, and those that cannot be read."""
     tasks: list[Task] = []
     unreadable: list[Failure] = []
     for entry in entries:

@@ -68,7 +68,7 @@ class Seeds:
     """Runs that only results are computed on."""
 
     def by_split(self) -> dict[str, list[int]]:
-        """The seeds of each split, ranges written out."""
+        """Return the seeds of each split, ranges written out."""
         return {name: parse_seeds(getattr(self, name)) for name in SPLITS}
 
 

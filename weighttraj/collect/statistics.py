@@ -44,13 +44,13 @@ class ObservationStatistics:
         self.mean[learners], self.var[learners], self.count[learners] = mean, var, count
 
     def normalize(self, observations: np.ndarray, learners: np.ndarray | slice) -> np.ndarray:
-        """Network inputs of some learners, float32 in the shape of the observations."""
+        """Return network inputs of some learners, float32 in the shape of the observations."""
         mean, var = self.mean[learners], self.var[learners]
         inputs = ((observations - mean) / np.sqrt(var + _EPSILON)).astype(np.float32)
         return np.asarray(np.clip(inputs, -_BOUND, _BOUND, out=inputs))
 
     def of(self, learner: int) -> Moments:
-        """A copy of one learner's statistics."""
+        """Return a copy of one learner's statistics."""
         mean, var = self.mean[learner].copy(), self.var[learner].copy()
         return mean, var, float(self.count[learner].item())
 
@@ -83,7 +83,7 @@ class RewardStatistics:
         return np.asarray(np.clip(scaled, -_BOUND, _BOUND, out=scaled))
 
     def of(self, learner: int) -> Moments:
-        """A copy of one learner's statistics."""
+        """Return a copy of one learner's statistics."""
         mean, var = (np.array(x[learner]) for x in (self.mean, self.var))
         return mean, var, float(self.count)
 
@@ -121,10 +121,10 @@ class Normalizer(Protocol):
         """
 
     def obs_norm(self, learner: int) -> Moments | None:
-        """A copy of the statistics of a learner's observations, if there are any."""
+        """Return a copy of the statistics of a learner's observations, if there are any."""
 
     def ret_norm(self, learner: int) -> Moments | None:
-        """A copy of the statistics of a learner's discounted rewards, if there are any."""
+        """Return a copy of the statistics of a learner's discounted rewards, if there are any."""
 
 
 class NoNormalizer:

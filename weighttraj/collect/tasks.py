@@ -1,4 +1,4 @@
-"""Runs to be made, alone by SB3 or in blocks by a population: what one process does."""
+"""Trains and records runs in one process: one by SB3, or a block of them as a population."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def _train_together(tasks: Sequence[Task], report: Report) -> list[Failure]:
                 stack.callback(followers[-1].close)
             del origins, origin  # their models are not needed any more
             population.train(followers, lambda: all(f.error for f in followers))
-    except Exception as error:  # it is everyone's
+    except Exception as error:  # the error affects every run of the block
         return [(task, error) for task in tasks]
     return [(f.task, f.error) for f in followers if f.error is not None]
 

@@ -43,7 +43,7 @@ def is_transparent(wrapper: gym.Wrapper[Any, Any, Any, Any]) -> bool:
 
 
 def is_transparent_vec(wrapper: VecEnvWrapper) -> bool:
-    """The same for a wrapper around a vectorised environment."""
+    """Return the same as ``is_transparent``, for a wrapper around a vectorised environment."""
 
     def attempt() -> bool:
         venv = DummyVecEnv([partial(_Inside, wrapper.venv, 2 * i) for i in range(wrapper.num_envs)])
@@ -55,7 +55,7 @@ def is_transparent_vec(wrapper: VecEnvWrapper) -> bool:
 
 
 def _tried(attempt: Callable[[], bool]) -> bool:
-    """Whether a trial succeeds, and raises nothing."""
+    """Return whether a trial succeeds, and raises nothing."""
     with undisturbed():
         try:
             return attempt()
@@ -94,7 +94,7 @@ class _Inside(gym.Env[Any, Any]):
 
 
 def _around(wrapper: Any, attribute: str, inside: Any) -> Any:
-    """A copy of a wrapper around something else. Its constructor is not called."""
+    """Return a copy of a wrapper around something else. Its constructor is not called."""
     around = object.__new__(type(wrapper))
     members = getattr(wrapper, "class_attributes", None)  # SB3's list of them cannot be copied
     memo = {id(getattr(wrapper, attribute)): inside, id(members): members}
@@ -109,7 +109,7 @@ def _passes(
     *,
     stack: bool = False,
 ) -> bool:
-    """Whether all observations and actions pass through.
+    """Return whether all observations and actions pass through.
 
     Args:
         reset: begins episodes; returns observations.
@@ -136,7 +136,7 @@ def _passes(
 
 
 def _same_spaces(outer: Any, inner: Any) -> bool:
-    """Whether both have the same spaces, of single arrays or numbers."""
+    """Return whether both have the same spaces, of single arrays or numbers."""
     pairs: Sequence[tuple[Any, Any]] = (
         (outer.observation_space, inner.observation_space),
         (outer.action_space, inner.action_space),

@@ -27,7 +27,7 @@ class ClipObservation(
         self.low, self.high = low, high
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        """The clipped observation, same shape and type."""
+        """Return the clipped observation, same shape and type."""
         return np.asarray(np.clip(observation, self.low, self.high))
 
 
@@ -43,6 +43,6 @@ class TruncationAsTermination(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordC
         gym.Wrapper.__init__(self, env)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """One step; ``truncated`` is always False."""
+        """Take one step; ``truncated`` is always False."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated or truncated, False, info

@@ -12,8 +12,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 Tell = Callable[..., None]
-"""Called by a task with what it wants known. It raises ``KeyboardInterrupt`` in a task that is to
-stop."""
+"""Progress callback of a task. It raises ``KeyboardInterrupt`` in a task that is to stop."""
 
 Outcome = tuple[T, R | Exception]
 """A task, and what it returned or raised."""
@@ -24,7 +23,7 @@ RETRIES = 2
 
 @runtime_checkable
 class Engine(Protocol):
-    """Does tasks. Functions, tasks and results must be picklable."""
+    """Runs tasks. Functions, tasks and results must be picklable."""
 
     workers: int
     """How many tasks it does at a time, as far as it knows."""

@@ -109,7 +109,7 @@ class _Worker(Generic[T, R]):
             note(*message)
 
     def take(self) -> tuple[T, int, R | BaseException]:
-        """The task that is done, its remaining tries, and its outcome."""
+        """Return the task that is done, its remaining tries, and its outcome."""
         assert self.future is not None  # noqa: S101
         future, self.future = self.future, None
         error = future.exception()
@@ -141,7 +141,7 @@ def _stop(workers: Sequence[_Worker[Any, Any]], note: Tell, *, wait: bool) -> No
 
 
 def _told(outcome: Any) -> Any:
-    """The outcome, in words if the process was killed each time."""
+    """Return the outcome, in words if the process was killed each time."""
     if not isinstance(outcome, BrokenProcessPool):
         return outcome
     return EngineError(

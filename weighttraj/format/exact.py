@@ -82,7 +82,7 @@ def decode(value: Any) -> Any:
 
 
 def _is_tag(value: dict[str, Any]) -> bool:
-    """Whether ``decode`` would take a dict for something else."""
+    """Return whether ``decode`` would take a dict for something else."""
     return value.keys() <= {_FLOAT, _TUPLE} and len(value) == 1
 
 

@@ -139,7 +139,7 @@ class ParamLayout:
     def unflatten(
         self, weights: Float32[np.ndarray, "*batch param"]
     ) -> dict[str, Float32[np.ndarray, "..."]]:
-        """Views of each parameter, ``{name: (*batch, *shape)}``.
+        """Return views of each parameter, ``{name: (*batch, *shape)}``.
 
         Raises:
             SnapshotError: the last axis is not the layout's size.

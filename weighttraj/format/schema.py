@@ -209,7 +209,7 @@ class Evaluation:
     normalizer: Literal["own", "final"] = "own"
     """Whose statistics normalised observations: the snapshot's own, or those of the last one."""
     simulator: str = ""
-    """What simulated: ``mujoco.batch``, ``gymnasium``; empty: not said."""
+    """What simulated: ``mujoco.batch``, ``gymnasium``; empty: not recorded."""
     packages: dict[str, str] = field(default_factory=dict)
     """Versions of each library that moves the numbers."""
 
@@ -246,13 +246,13 @@ class RunInfo:
     )
     """How the weights act."""
     env: EnvInfo | None = None
-    """Environment; None: not said."""
+    """Environment; None: not recorded."""
     algorithm: Algorithm | None = None
-    """Algorithm; None: not said."""
+    """Algorithm; None: not recorded."""
     seed: int | None = None
     """Seed of the run."""
     cadence: Cadence | None = None
-    """When snapshots were taken; None: not said."""
+    """When snapshots were taken; None: not recorded."""
     continues: Continuation | None = None
     """Training that the run goes on from; None: it begins with an untrained policy, or a version
     before this key was written."""
@@ -302,7 +302,7 @@ class RunInfo:
             )
 
     def committed(self, axis: Axis) -> int:
-        """Rows along an axis that readers may see."""
+        """Return rows along an axis that readers may see."""
         return self.n_committed if axis == "time" else self.n_committed_iterations
 
 
@@ -390,7 +390,7 @@ class ArraySpec:
 
 
 def arrays_of(info: RunInfo) -> dict[str, ArraySpec]:
-    """The arrays of a run, by name, in the order of ``FORMAT.md``."""
+    """Return the arrays of a run, by name, in the order of ``FORMAT.md``."""
     param = (info.layout.size,)
     specs = [
         _array("policy/weights", "float32", param, "param"),
@@ -469,7 +469,7 @@ def parse(document: object, kind: type[T], where: object) -> T:
 
 
 def load_json(text: bytes, where: object) -> Any:
-    """Any JSON value.
+    """Parse JSON text.
 
     Raises:
         FormatError: the text is no JSON.
@@ -501,7 +501,7 @@ def _is_deep(value: Any) -> bool:
 
 
 def _no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; readers do not agree on which of two equal keys counts."""
+    """Return an object of JSON; readers do not agree on which of two equal keys counts."""
     if len(dict(pairs)) < len(pairs):
         raise ValueError(f"a key is there twice, among {[key for key, _ in pairs][:20]}")
     return dict(pairs)
@@ -537,5 +537,5 @@ def check_id(value: str, what: str) -> str:
 
 
 def with_progress(info: RunInfo, *, status: Status, time: int, iteration: int) -> RunInfo:
-    """The metadata after a commit."""
+    """Return the metadata after a commit."""
     return replace(info, status=status, n_committed=time, n_committed_iterations=iteration)

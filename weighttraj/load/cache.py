@@ -67,7 +67,7 @@ class CachedWeights:
         return cache_folder() / f"{self.key}.npy"
 
     def map(self) -> Float32[np.ndarray, "time param"]:
-        """A read-only map of the weights, decoded first if no process has done so.
+        """Return a read-only map of the weights, decoded first if no process has done so.
 
         Raises:
             CacheError: the cache's folder cannot be used, or is full.
@@ -127,7 +127,7 @@ def cache_folder() -> Path:
 
 
 def cache_size() -> int:
-    """Bytes in the cache, with what killed processes left there."""
+    """Return bytes in the cache, with what killed processes left there."""
     folder = cache_folder()
     with _told(folder):
         return sum(size for digit in _DIGITS for _, size in _files(folder, digit))
@@ -177,7 +177,7 @@ def _locked(folder: Path, digit: str) -> Iterator[None]:
 
 
 def _mapped(path: Path, shape: tuple[int, int]) -> np.ndarray | None:
-    """The map of a whole entry; None: there is none, or it is not what its name says."""
+    """Return the map of a whole entry; None: there is none, or it is not what its name says."""
     header = _header(shape)
     with _told(path.parent):
         try:
@@ -201,7 +201,7 @@ def _header(shape: tuple[int, int]) -> bytes:
 
 @contextmanager
 def _told(folder: Path) -> Iterator[None]:
-    """Errors of the cache's own files, as one that says how to move it."""
+    """Turn errors of the cache's own files into one that says how to move it."""
     try:
         yield
     except OSError as error:

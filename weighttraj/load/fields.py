@@ -84,7 +84,7 @@ def _check_shapes(runs: Sequence[Run], name: str) -> None:
 
 
 def _source(name: str) -> str:
-    """Name of the array that a tensor of an item is read from."""
+    """Return the name of the array that a tensor of an item is read from."""
     return "eval/returns" if name == "returns" else name if "/" in name else f"index/{name}"
 
 

@@ -83,7 +83,7 @@ class ResumableLoader:
         return self._plan.epoch
 
     def state_dict(self) -> LoaderState:
-        """Where the loader stands. Batches that workers hold ready are not counted.
+        """Return where the loader stands. Batches that workers hold ready are not counted.
 
         Taken inside the loop, it counts the batch in hand. After an epoch's last batch it is the
         end of that epoch: a loader that takes it up has none left in it, then begins the next.
@@ -119,7 +119,7 @@ class ResumableLoader:
                 expected={name: own[name] for name in other},
                 got={name: state[name] for name in other},
                 where=self.data,
-                do="make the data set and the loader as they were, or begin anew without the state",
+                do="make the data set and the loader as they were, or start without the state",
             )
         plan = self._plan
         plan.seed, plan.epoch, plan.batch = (state[name] for name in _PLACE)
@@ -130,7 +130,7 @@ class ResumableLoader:
         return len(self._plan)
 
     def __iter__(self) -> Iterator[Batch]:
-        """The batches left in this epoch.
+        """Yield the batches left in this epoch.
 
         Raises:
             LoaderError: another iteration was begun, or a state loaded, since this one was.
@@ -190,7 +190,7 @@ class _Batches(Dataset[Batch]):
 
 
 def epoch_order(n: int, seed: int, epoch: int) -> Int64[np.ndarray, " n"]:
-    """A shuffled order of n items, the same with every version of numpy.
+    """Return a shuffled order of n items, the same with every version of numpy.
 
     Numpy promises the streams of its bit generators for all versions, but not those of
     ``Generator.permutation``.

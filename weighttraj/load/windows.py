@@ -130,7 +130,7 @@ class RunDataset(Dataset[Item]):
         return len(self.index)
 
     def __getitem__(self, i: int) -> Item:
-        """One item; raises as ``batch`` does."""
+        """Return one item; raises as ``batch`` does."""
         run, t = self.index[i].tolist()
         if not self._others:
             weights = torch.from_numpy(self._view(run, t).copy())
@@ -154,14 +154,14 @@ class RunDataset(Dataset[Item]):
         ]
 
     def _view(self, run: int, t: int) -> np.ndarray:
-        """Rows of the map itself. To write to them would end the process: copies go out."""
+        """Return rows of the map itself. To write to them would end the process: copies go out."""
         rows = self._maps.get(run)
         if rows is None:
             rows = self._rows(run)
         return rows[t - self.window + 1 : t + 1]
 
     def _field(self, name: str, run: int, t: int) -> np.ndarray:
-        """Rows of another field, as ``_view`` those of the weights."""
+        """Return rows of another field, as ``_view`` those of the weights."""
         return self._fields_of(run)[name][t - self.window + 1 : t + 1]
 
     def _rows(self, run: int) -> Float32[np.ndarray, "time param"]:
@@ -173,13 +173,13 @@ class RunDataset(Dataset[Item]):
         return rows
 
     def _fields_of(self, run: int) -> dict[str, np.ndarray]:
-        """All other fields of a run, read when the first item of it is asked for."""
+        """Return all other fields of a run, read when the first item of it is asked for."""
         if run not in self._values:
             self._values[run] = {name: values(self.runs[run], name) for name in self._others}
         return self._values[run]
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a spawned worker gets: where the rows are, not the rows."""
+        """Return what a spawned worker gets: where the rows are, not the rows."""
         return {**self.__dict__, "_maps": {}}
 
 
@@ -259,7 +259,7 @@ def _stack(views: list[np.ndarray]) -> Tensor:
 
 
 def _stack_shared(views: list[np.ndarray]) -> Tensor:
-    """The same in a worker, right into the memory that it shares with the main process."""
+    """Return the same in a worker, right into the memory that it shares with the main process."""
     with warnings.catch_warnings():  # torch fears for the map, which here is only read
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
         stacked: Tensor = default_collate([torch.from_numpy(view) for view in views])

@@ -65,29 +65,29 @@ class PolicyBatch:
         return len(self.weights)
 
     def __getitem__(self, chosen: slice | np.ndarray | Sequence[int]) -> PolicyBatch:
-        """Some of the policies."""
+        """Return some of the policies."""
         mean, var = (None if x is None else x[chosen] for x in (self.mean, self.var))
         return PolicyBatch(self.spec, self.layout, self.weights[chosen], self.obs_norm, mean, var)
 
     def with_weights(self, weights: Float32[np.ndarray, "policy param"]) -> PolicyBatch:
-        """The same structure and normalisers with other weights, such as forecasts."""
+        """Return the same structure and normalisers with other weights, such as forecasts."""
         return PolicyBatch(self.spec, self.layout, weights, self.obs_norm, self.mean, self.var)
 
     def normalize(self, observations: np.ndarray) -> np.ndarray:
-        """Network inputs, float32, for raw observations ``(policy, episode, *obs)``."""
+        """Return network inputs, float32, for raw observations ``(policy, episode, *obs)``."""
         if self.mean is None or self.var is None:
             return np.asarray(observations, np.float32)
         return normalize(observations, self.obs_norm, self.mean[:, None], self.var[:, None])
 
     @torch.no_grad()
     def outputs(self, inputs: Float32[np.ndarray, "policy episode *obs"]) -> Tensor:
-        """Means, logits or values (policy, episode, output) for network inputs."""
+        """Return means, logits or values (policy, episode, output) for network inputs."""
         return self._outputs(inputs)[0]
 
     def _outputs(
         self, inputs: Float32[np.ndarray, "policy episode *obs"]
     ) -> tuple[Tensor, Tensor | None]:
-        """Outputs of the last layer, and the deviation of each where the head has one."""
+        """Return outputs of the last layer, and the deviation of each where the head has one."""
         hidden = torch.from_numpy(inputs).flatten(2)
         activation = ACTIVATIONS[self.spec.activation]
         for weight, bias in self._layers[:-1]:
@@ -102,7 +102,7 @@ class PolicyBatch:
     def distribution(
         self, inputs: Float32[np.ndarray, "policy episode *obs"]
     ) -> Normal | Categorical:
-        """Distributions over unclipped actions for network inputs, (policy, episode, ...).
+        """Return distributions over unclipped actions for network inputs, (policy, episode, ...).
 
         Raises:
             PolicyError: the policies have none, as they act in one way only.
@@ -121,7 +121,7 @@ class PolicyBatch:
 
     @torch.no_grad()
     def act(self, observations: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
-        """Actions ``(policy, episode, *action)``, clipped to the action space.
+        """Return actions ``(policy, episode, *action)``, clipped to the action space.
 
         Args:
             observations: raw, ``(policy, episode, *obs)``.
@@ -148,7 +148,7 @@ class PolicyBatch:
 def load_policies(
     run: Run, rows: slice | Sequence[int] | np.ndarray, *, final_normalizer: bool = False
 ) -> PolicyBatch:
-    """Snapshots of a run as policies, each with the normaliser that it acted with.
+    """Return snapshots of a run as policies, each with the normaliser that it acted with.
 
     Args:
         run: the run.

@@ -148,7 +148,7 @@ def _recorded_spaces(run: Run) -> tuple[spaces.Box, spaces.Space[Any]]:
 
 
 def _cast(recorded: spaces.Space[Any], like: spaces.Space[Any]) -> spaces.Space[Any]:
-    """Bounds are recorded as numbers; the environment's type of them does not matter."""
+    """Return a recorded space with the environment's type of numbers, which does not matter."""
     if isinstance(recorded, spaces.Box) and isinstance(like, spaces.Box):
         return spaces.Box(recorded.low, recorded.high, dtype=like.dtype)
     return recorded
@@ -219,7 +219,7 @@ def _model(
 
 
 def _actor(run: Run, t: int) -> dict[str, torch.Tensor]:
-    """The actor's parameters, under SB3's names."""
+    """Return the actor's parameters, under SB3's names."""
     tensors = run.layout.unflatten(run.weights[t])
     spec = run.info.policy
     named: dict[str, np.ndarray] = {}
@@ -233,7 +233,7 @@ def _actor(run: Run, t: int) -> dict[str, torch.Tensor]:
 
 
 def _critic(run: Run, t: int) -> dict[str, torch.Tensor]:
-    """The critic's parameters at t; empty: not stored."""
+    """Return the critic's parameters at t; empty: not stored."""
     layout = run.info.critic_layout
     if layout is None:
         return {}
@@ -242,7 +242,7 @@ def _critic(run: Run, t: int) -> dict[str, torch.Tensor]:
 
 
 def _arguments(run: Run, t: int, kind: str) -> dict[str, Any]:
-    """Arguments of the algorithm, as far as the run tells."""
+    """Return arguments of the algorithm, as far as the run tells."""
     hyper = run.info.algorithm.hyperparameters if run.info.algorithm else {}
     arguments = {name: hyper[name] for name in _ARGUMENTS[kind] if name in hyper}
     tables = {"learning_rate": "lr_schedule", **{name: name for name in _SCHEDULES[kind]}}
@@ -261,12 +261,12 @@ def _arguments(run: Run, t: int, kind: str) -> dict[str, Any]:
 
 
 def _units(run: Run) -> list[int]:
-    """Units of the actor's hidden layers."""
+    """Return units of the actor's hidden layers."""
     return [run.layout[bias].size for _, bias in run.info.policy.layers[:-1]]
 
 
 def _critic_units(run: Run) -> list[int]:
-    """Units of the critic's hidden layers; the actor's, if the critic is not stored."""
+    """Return units of the critic's hidden layers; the actor's, if the critic is not stored."""
     layout = run.info.critic_layout
     if layout is None:
         return _units(run)

@@ -40,24 +40,24 @@ class Kernel:
         self._skip = self.hidden_positions if excludes else 0
 
     def observe(self, state: State) -> np.ndarray:
-        """Observations, float64 (simulation, obs)."""
+        """Return observations, float64 (simulation, obs)."""
         velocity = state["qvel"]
         if self.max_velocity is not None:
             velocity = np.clip(velocity, -self.max_velocity, self.max_velocity)
         return np.concatenate((state["qpos"][:, self._skip :], velocity), axis=1)
 
     def memory(self, state: State) -> np.ndarray:
-        """What the next step's reward needs of the state before it."""
+        """Return what the next step's reward needs of the state before it."""
         return state["qpos"][:, 0].copy()
 
     def terminated(self, state: State) -> np.ndarray:
-        """Whether the episode ends here, bool (simulation,)."""
+        """Return whether the episode ends here, bool (simulation,)."""
         return np.zeros(len(state["qpos"]), bool)
 
     def reward(
         self, before: np.ndarray, state: State, action: np.ndarray, terminated: np.ndarray
     ) -> np.ndarray:
-        """Rewards of a step, float64 (simulation,).
+        """Return rewards of a step, float64 (simulation,).
 
         Args:
             before: ``memory`` of the state before the step.
@@ -257,5 +257,5 @@ def _square(x: np.ndarray) -> np.ndarray:
 
 
 def _norm(vectors: np.ndarray) -> np.ndarray:
-    """Euclidean norms, rounded as ``np.linalg.norm`` rounds that of a single vector."""
+    """Return Euclidean norms, rounded as ``np.linalg.norm`` rounds that of a single vector."""
     return np.asarray(np.sqrt(np.matmul(vectors[:, None, :], vectors[:, :, None])[:, 0, 0]))

@@ -68,18 +68,18 @@ class Policy:
         self._layers = [(weight.clone(), bias.clone()) for weight, bias in layers]
 
     def with_weights(self, weights: Float32[np.ndarray, " param"]) -> Policy:
-        """The same structure and normaliser with other weights, such as a forecast's."""
+        """Return the same structure and normaliser with other weights, such as a forecast's."""
         return Policy(self.spec, self.layout, weights, self.obs_norm, self.stats)
 
     def normalize(self, observation: np.ndarray) -> np.ndarray:
-        """Network inputs, float32, for raw observations of any batch shape."""
+        """Return network inputs, float32, for raw observations of any batch shape."""
         if self.stats is None:
             return np.asarray(observation, np.float32)
         return normalize(observation, self.obs_norm, self.stats.mean, self.stats.var)
 
     @torch.no_grad()
     def distribution(self, inputs: Tensor) -> Normal | Categorical:
-        """Distribution over unclipped actions for network inputs ``(batch, *observation)``.
+        """Return distributions over unclipped actions for network inputs ``(batch, *observation)``.
 
         Of a squashed Gaussian: before tanh.
 
@@ -107,7 +107,7 @@ class Policy:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions for raw observations; SB3's signature.
+        """Return actions for raw observations; SB3's signature.
 
         Args:
             observation: ``(*observation)`` or ``(batch, *observation)``, not normalised.
@@ -137,7 +137,7 @@ class Policy:
 
     @torch.no_grad()
     def _outputs(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Outputs of the last layer, and the deviation where a layer gives it."""
+        """Return outputs of the last layer, and the deviation where a layer gives it."""
         hidden = inputs.flatten(1)
         activation = ACTIVATIONS[self.spec.activation]
         for weight, bias in self._layers[:-1]:
@@ -186,7 +186,7 @@ def check_acts(weights: np.ndarray, rows: Sequence[int] | np.ndarray, where: obj
 
 
 def load_policy(run: Run, t: int = -1) -> Policy:
-    """The policy of snapshot t of a run, with the normaliser that it acted with at t.
+    """Return the policy of snapshot t of a run, with the normaliser that it acted with at t.
 
     Raises:
         PolicyError: the run's policy cannot be rebuilt, or its weights are not finite; the message
@@ -244,7 +244,7 @@ def deviation_layer(
 def normalize(
     observation: np.ndarray, norm: ObsNorm | None, mean: np.ndarray, var: np.ndarray
 ) -> np.ndarray:
-    """Network inputs, float32; mean and var are broadcast to the observations."""
+    """Return network inputs, float32; mean and var are broadcast to the observations."""
     if norm is None:
         return np.asarray(observation, np.float32)
     mean, var = mean.astype(norm.dtype), var.astype(norm.dtype)
@@ -275,7 +275,7 @@ def to_actions(spec: PolicySpec, values: Tensor) -> np.ndarray:
 
 
 def _bound(values: tuple[float, ...], shape: tuple[int, ...]) -> np.ndarray:
-    """Bounds of an action in float32, or in float64 where float32 would change them."""
+    """Return bounds of an action in float32, or in float64 where float32 would change them."""
     exact = np.array(values, np.float64).reshape(shape)
     short = exact.astype(np.float32)
     return short if np.array_equal(short, exact) else exact

@@ -94,7 +94,7 @@ class ReturnsConfig:
         return sorted(chosen | {snapshots - 1}) if snapshots else []
 
     def evaluation(self, simulator: str) -> Evaluation:
-        """What the run's metadata say of it."""
+        """Return what the run's metadata say of it."""
         seeds = tuple(range(self.seed, self.seed + self.episodes))
         return Evaluation(
             seeds=seeds * len(self.modes),
@@ -325,7 +325,7 @@ class _Work:
         return {int(row): (returns[row], lengths[row]) for row in known}
 
     def _header(self) -> dict[str, Any]:
-        """What a journal must begin with to be of this run and these settings."""
+        """Return what a journal must begin with to be of this run and these settings."""
         digest = self.run["digest"][-1].tobytes().hex() if len(self.run) else ""
         told = asdict(self.evaluation) | {"digest": digest, "snapshots": len(self.run)}
         del told["learning"]  # as `every` and `first`, it does not change how episodes are played
@@ -341,7 +341,7 @@ class _Journal:
     Args:
         dataset: folder of the data set. It may be a stranger's: no part of the path is a link.
         name: of the file.
-        header: its first line; a journal with another one is begun anew.
+        header: its first line; a journal with another one is begun again.
 
     Raises:
         FormatError: the journal, or its folder, is a link.
@@ -353,7 +353,7 @@ class _Journal:
         self.rows = self._read()
 
     def begin(self) -> None:
-        """Write it anew with the lines that hold."""
+        """Write the journal again, with the lines that are whole."""
         replace_file(self._path, _line(self._header), root=self._root)
         self.append(self.rows)
 
@@ -374,7 +374,7 @@ class _Journal:
         return rows
 
     def _fits(self, entry: _Entry) -> bool:
-        """Whether a line is of a snapshot of the run, and has a column for each episode."""
+        """Return whether a line is of a snapshot of the run, and has a column for each episode."""
         episodes = len(self._header["seeds"])
         columns = len(entry.returns) == len(entry.lengths) == episodes
         return columns and 0 <= entry.t < self._header["snapshots"]
@@ -422,7 +422,7 @@ def _line(entry: dict[str, Any]) -> bytes:
 
 
 def _finished(dataset: Dataset, console: Console) -> list[Run]:
-    """Runs that will not change; a folder that is packed is to go, with what it would be given."""
+    """Return finished runs. Skip folders that are already packed: they are about to be deleted."""
     left: dict[str, list[str]] = {}
     done = []
     for run in dataset:

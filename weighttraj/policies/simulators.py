@@ -60,7 +60,7 @@ class Simulator(Protocol):
 
 
 def make_simulator(make: Callable[[], gym.Env[Any, Any]], seeds: Sequence[int]) -> Simulator:
-    """The fastest simulator that there is for an environment.
+    """Return the fastest simulator that there is for an environment.
 
     Args:
         make: makes the environment.
@@ -137,7 +137,7 @@ class Physics:
 
 
 def start_of(kernel: Kernel, observation: np.ndarray) -> Start:
-    """The state in which the kernel's environment stands, just after its ``reset``.
+    """Return the state in which the kernel's environment stands, just after its ``reset``.
 
     Args:
         kernel: the environment's.
@@ -218,7 +218,7 @@ class GymnasiumSimulator:
         )
 
     def _broke(self, sim: int) -> bool:
-        """Whether MuJoCo, if it is behind the environment, has reset a broken simulation."""
+        """Return whether MuJoCo, if it is behind the environment, has reset a broken simulation."""
         data = getattr(self._envs[sim].unwrapped, "data", None)
         if not isinstance(data, mujoco.MjData):
             return False

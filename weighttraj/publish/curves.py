@@ -54,7 +54,7 @@ class Band:
 
 
 def mean_returns(run: Run, kind: Kind) -> Float64[np.ndarray, " time"] | None:
-    """Mean return of each snapshot, NaN where there is none; None: the run stores none.
+    """Return the mean return of each snapshot, NaN where there is none; None: the run stores none.
 
     Training returns are the mean over the last episodes before a snapshot, of several policies.
     """
@@ -67,7 +67,7 @@ def mean_returns(run: Run, kind: Kind) -> Float64[np.ndarray, " time"] | None:
 
 
 def best_returns(run: Run) -> tuple[Float64[np.ndarray, " time"], Kind] | None:
-    """The first kind of returns that the run has, deterministic ones before others."""
+    """Return the first kind of returns that the run has, deterministic ones before others."""
     for kind in KINDS:
         values = mean_returns(run, kind)
         if values is not None and np.isfinite(values).any():
@@ -76,7 +76,7 @@ def best_returns(run: Run) -> tuple[Float64[np.ndarray, " time"], Kind] | None:
 
 
 def final_return(run: Run) -> tuple[float, Kind]:
-    """The last return of the first kind that the run has; NaN: none."""
+    """Return the last return of the first kind that the run has; NaN: none."""
     found = best_returns(run)
     if found is None:
         return float("nan"), "training"
@@ -85,7 +85,7 @@ def final_return(run: Run) -> tuple[float, Kind]:
 
 
 def curves(runs: Sequence[Run], kind: Kind) -> list[Curve]:
-    """A curve for each run that has returns of this kind."""
+    """Return a curve for each run that has returns of this kind."""
     found = []
     for run in runs:
         values = mean_returns(run, kind)
@@ -95,7 +95,7 @@ def curves(runs: Sequence[Run], kind: Kind) -> list[Curve]:
 
 
 def band(lines: Sequence[Curve]) -> Band:
-    """Median and quartiles over runs, at steps that at least one of them covers.
+    """Return median and quartiles over runs, at steps that at least one of them covers.
 
     Between two snapshots a run's return is interpolated.
     """

@@ -60,7 +60,7 @@ class Episode:
 
 
 def choose(run: Run, seed: int) -> Moments:
-    """The start, and where the return first passes 25, 50, 75 and 100 % of its range.
+    """Return the start, and where the return first passes 25, 50, 75 and 100 % of its range.
 
     Returns are the stored ones of deterministic actions, else those of some episodes played now.
     So are those between two snapshots over which a policy learns nearly all it learns.
@@ -95,7 +95,7 @@ def choose(run: Run, seed: int) -> Moments:
 def moments(
     snapshots: Int64[np.ndarray, " point"], values: Float64[np.ndarray, " point"]
 ) -> tuple[int, ...]:
-    """Five snapshots, or all if there are fewer, at which the values rise.
+    """Return five snapshots, or all if there are fewer, at which the values rise.
 
     Where they pass several shares of their range at once, others are added, evenly spaced in log t.
     """
@@ -113,7 +113,7 @@ def moments(
 
 
 def _candidates(count: int) -> Int64[np.ndarray, " point"]:
-    """Snapshots at which returns are tried, the first and last included."""
+    """Return snapshots at which returns are tried, the first and last included."""
     last = count - 1
     spaced = [0, *np.geomspace(1, max(last, 1), PROBES), *np.linspace(0, last, PROBES)]
     found: np.ndarray = np.unique(np.round(spaced).astype(np.int64))
@@ -139,7 +139,7 @@ def _between(
 def _probe(
     run: Run, snapshots: Int64[np.ndarray, " point"], evaluator: Evaluator
 ) -> Float64[np.ndarray, " point"]:
-    """Mean return of some episodes of each snapshot; NaN: the simulation became unstable."""
+    """Return the mean return of episodes of each snapshot; NaN: the simulation became unstable."""
     means: np.ndarray = evaluator(load_policies(run, snapshots)).returns.mean(1)
     return means
 
@@ -169,11 +169,11 @@ class Stage:
         self.view: View = view_of(self.model)
 
     def pose(self, placement: Placement) -> Pose:
-        """What is seen."""
+        """Return what is seen of the model."""
         return pose_of(self.model, placement, self.view)
 
     def play(self, run: Run, t: int, *, seed: int, shown: int) -> Episode:
-        """One episode of snapshot t, with the mode of its actions.
+        """Play one episode of snapshot t, with the mode of its actions.
 
         Args:
             run: the run.

@@ -42,7 +42,7 @@ _GROUPS = 6  # of phases
 
 
 def returns(lines: Sequence[Curve], kind: Kind) -> Picture:
-    """Learning curves: thin lines of the runs, their median and interquartile band.
+    """Draw learning curves: thin lines of the runs, their median and interquartile band.
 
     Args:
         lines: at least one.
@@ -126,7 +126,7 @@ def phase_table(
 
 
 def spectra(walks: Sequence[Walk]) -> Picture:
-    """Singular values over the largest one, against their number."""
+    """Draw singular values over the largest one, against their number."""
     fig, axes = blank()
     for walk in walks:
         _thin_line(axes, walk.singular / (walk.singular[0] or 1), len(walks))
@@ -143,7 +143,7 @@ def spectra(walks: Sequence[Walk]) -> Picture:
 
 
 def tails(walks: Sequence[Walk]) -> Picture:
-    """Share of the squared Frobenius norm beyond rank d."""
+    """Draw the share of the squared Frobenius norm beyond rank d."""
     fig, axes = blank()
     for walk in walks:
         left = np.where(walk.beyond > SHARE_FLOOR, walk.beyond, np.nan)
@@ -167,7 +167,7 @@ def path(
     limits: tuple[float, float],
     what: str,
 ) -> Picture:
-    """The way of one run's weights in the two directions in which it goes farthest.
+    """Draw the way of one run's weights in the two directions in which it goes farthest.
 
     Args:
         run: its id.
@@ -207,7 +207,7 @@ def path(
 
 
 def _away(way: Float64[np.ndarray, "point 2"], end: int) -> Float64[np.ndarray, " 2"]:
-    """Direction from the path around one of its ends to where the path is not."""
+    """Return the direction from the path around one of its ends to where the path is not."""
     distance = np.hypot(*(way - way[end]).T)
     towards = way[end] - way[distance <= 0.2 * distance.max()].mean(0)
     length = float(np.hypot(*towards))

@@ -144,7 +144,7 @@ def _frames(
 
 
 def _poses(stage: Stage, episode: Episode, timing: _Timing) -> list[Pose]:
-    """What is seen in each frame, to the end of the episode, and there."""
+    """Return what is seen in each frame, to the end of the episode, and there."""
     places = episode.placements[:: timing.stride]
     if len(episode.placements) > len(episode.rewards):  # all of it is shown
         places.append(episode.placements[-1])
@@ -166,7 +166,7 @@ def _mosaic(cells: list[Image.Image]) -> Image.Image:
 def _panel(
     i: int, episode: Episode, step: int, image: Image.Image, fonts: dict[int, Any]
 ) -> Image.Image:
-    """One episode at one time, with its caption; dimmed when it is over."""
+    """Draw one episode at one time, with its caption; dimmed when it is over."""
     over = step >= len(episode.rewards)
     if over:
         image = Image.blend(image, Image.new("RGB", image.size, PANEL), 0.55)
@@ -187,7 +187,7 @@ def _panel(
 
 
 def _legend(curve: Curve, episodes: list[Episode], fonts: dict[int, Any]) -> Image.Image:
-    """The returns over the training, with a mark for each panel."""
+    """Draw the returns over the training, with a mark for each panel."""
     image = Image.new("RGB", _SIZE, _BACK)
     known = np.isfinite(curve.returns)
     if not known.any():
@@ -235,7 +235,7 @@ def _badge(pencil: Any, at: tuple[float, float], text: int, font: Any) -> None:
 
 
 def _font(size: int) -> Any:
-    """A font that comes with matplotlib: the same pixels on every machine."""
+    """Return a font that comes with matplotlib: the same pixels on every machine."""
     return ImageFont.truetype(str(Path(mpl.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), size)
 
 

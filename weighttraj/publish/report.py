@@ -178,7 +178,7 @@ def shown(value: Any) -> Any:
 
 
 def _returns(runs: Sequence[Run]) -> dict[str, Any]:
-    """Learning curves; those of training episodes only where nothing else is stored."""
+    """Return learning curves; those of training episodes only where nothing else is stored."""
     pictures: list[Picture] = []
     table = []
     for kind in KINDS:
@@ -198,7 +198,7 @@ def _returns(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _played(runs: Sequence[Run]) -> list[str]:
-    """How the stored episodes were played, each way once."""
+    """Return how the stored episodes were played, each way once."""
     ways = []
     for run in runs:
         if (said := run.evaluation) is not None:
@@ -229,7 +229,7 @@ def _weights(runs: Sequence[Run], walks: Sequence[Walk]) -> dict[str, Any]:
 
 
 def _paths(runs: Sequence[Run], walks: Sequence[Walk]) -> dict[str, Any]:
-    """The paths of some runs, with one scale of colours for all."""
+    """Return the paths of some runs, with one scale of colours for all."""
     order = np.argsort([np.nan_to_num(final_return(run)[0]) for run in runs], kind="stable")
     some = sorted(order[np.unique(np.linspace(0, len(runs) - 1, MAX_PATHS).round().astype(int))])
     found = [best_returns(runs[i]) for i in some]
@@ -250,7 +250,7 @@ def _paths(runs: Sequence[Run], walks: Sequence[Walk]) -> dict[str, Any]:
 
 
 def _sampled(walks: Sequence[Walk], lengths: Sequence[int]) -> str:
-    """How many snapshots the spectrum is of."""
+    """Return how many snapshots the spectrum is of."""
     used, there = ([len(w.rows) for w in walks], lengths)
     counts = sorted({f"{u:,} of its {n:,}" for u, n in zip(used, there, strict=True)})
     if all(u == n for u, n in zip(used, there, strict=True)):
@@ -260,7 +260,7 @@ def _sampled(walks: Sequence[Walk], lengths: Sequence[int]) -> str:
 
 
 def _ranks(walks: Sequence[Walk]) -> list[tuple[str, str]]:
-    """The components that a share needs: of one run, or the fewest and most of several."""
+    """Return the components that a share needs: of one run, or the fewest and most of several."""
     rows = []
     for share in _SHARES:
         found = [rank_for(w, share) for w in walks]
@@ -285,7 +285,7 @@ def _typical(runs: Sequence[Run]) -> int:
 
 
 def _film(run: Run, seed: int, progress: Progress, task: Any) -> tuple[dict[str, Any] | None, str]:
-    """What the template shows of the film, or why there is none."""
+    """Return what the template shows of the film, or why there is none."""
     try:
         with needs("sb3"):
             from weighttraj.publish.film import film

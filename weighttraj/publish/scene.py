@@ -124,7 +124,7 @@ def view_of(model: Any) -> View:
 
 
 def placement_of(data: Any, view: View) -> Placement:
-    """A copy of what the simulation says now."""
+    """Return a copy of what the simulation says now."""
     return Placement(
         places=data.geom_xpos.copy(),
         turns=data.geom_xmat.reshape(-1, 3, 3).copy(),
@@ -152,7 +152,7 @@ def pose_of(model: Any, placement: Placement, view: View) -> Pose:
 
 
 def camera_for(poses: Sequence[Pose], view: View, size: tuple[int, int], top: int) -> Camera:
-    """A camera that keeps nearly all of what happens in the picture.
+    """Return a camera that keeps nearly all of what happens in the picture.
 
     Args:
         poses: at least one.
@@ -178,7 +178,7 @@ def camera_for(poses: Sequence[Pose], view: View, size: tuple[int, int], top: in
 
 
 def draw(pose: Pose, view: View, camera: Camera, font: Any) -> Image.Image:
-    """The scene at the camera's size.
+    """Draw the scene at the camera's size.
 
     Args:
         pose: what is seen.
@@ -198,7 +198,7 @@ def draw(pose: Pose, view: View, camera: Camera, font: Any) -> Image.Image:
 
 
 def hull(points: Points) -> Float64[np.ndarray, "corner 2"]:
-    """Corners of the convex hull, in order (Andrew's monotone chain)."""
+    """Return corners of the convex hull, in order (Andrew's monotone chain)."""
     ordered = sorted({(x, y) for x, y in points.round(9).tolist()})
     if len(ordered) < 3:
         return np.array(ordered)
@@ -218,7 +218,7 @@ def hull(points: Points) -> Float64[np.ndarray, "corner 2"]:
 
 
 def _surface(model: Any, placement: Placement, geom: int, view: View) -> Points | None:
-    """Points of the picture whose hull is the silhouette; None: the geom has none."""
+    """Return points of the picture whose hull is the silhouette; None: the geom has none."""
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     across = list(view.across)
     place, turned = placement.places[geom][across], placement.turns[geom][across]
@@ -245,7 +245,7 @@ def _ellipse(axes: Float64[np.ndarray, "2 3"]) -> Points:
 
 
 def _color(rgba: Any, *, still: bool) -> Color:
-    """The model's colour, a little brighter; what cannot move is muted."""
+    """Return the model's colour, a little brighter; what cannot move is muted."""
     red, green, blue = (0.25 + 0.75 * float(c) for c in rgba[:3])
     if still:
         grey = (red + green + blue) / 3

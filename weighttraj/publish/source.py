@@ -65,7 +65,7 @@ def open_source(path: str | Path) -> Source:
 
 
 def facts(source: Source) -> Facts:
-    """What stands at the top of the page."""
+    """Return what stands at the top of the page."""
     runs = source.runs
     found: Facts = [
         ("environment", environment_of(runs)),
@@ -85,7 +85,7 @@ def facts(source: Source) -> Facts:
 
 
 def run_rows(runs: Iterable[Run]) -> list[dict[str, str]]:
-    """The table of runs: one line each, in the data set's order."""
+    """Return the table of runs: one line each, in the data set's order."""
     return [
         {
             "id": run.id,
@@ -101,7 +101,7 @@ def run_rows(runs: Iterable[Run]) -> list[dict[str, str]]:
 
 
 def settings(source: Source) -> str:
-    """Hyper-parameters and environment of the first run, as JSON."""
+    """Return hyper-parameters and environment of the first run, as JSON."""
     info = source.runs[0].info
     said = {
         "algorithm": asdict(info.algorithm) if info.algorithm else None,
@@ -113,7 +113,7 @@ def settings(source: Source) -> str:
 
 
 def lead(source: Source) -> str:
-    """The page's first sentence."""
+    """Return the page's first sentence."""
     names = _values(source.runs, lambda r: r.info.algorithm.name if r.info.algorithm else "")
     runs, snapshots = len(source.runs), sum(map(len, source.runs))
     return (
@@ -122,19 +122,19 @@ def lead(source: Source) -> str:
 
 
 def environment_of(runs: Iterable[Run]) -> str:
-    """Ids of the environments."""
+    """Return ids of the environments."""
     return _values(runs, lambda r: r.info.env.id if r.info.env else "not said")
 
 
 def number(value: float) -> str:
-    """A number for readers: 1,224 or 0.0312; a dash for NaN."""
+    """Write a number for readers: 1,224 or 0.0312; a dash for NaN."""
     if not math.isfinite(value):
         return DASH
     return (f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}").replace("-", MINUS)
 
 
 def size(count: int) -> str:
-    """Bytes for readers."""
+    """Write a number of bytes for readers, such as 1.2 MB."""
     for unit, factor in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
         if count >= factor:
             return f"{count / factor:.3g} {unit}"
@@ -142,7 +142,7 @@ def size(count: int) -> str:
 
 
 def _values(runs: Iterable[Run], value: Callable[[Run], str]) -> str:
-    """What the runs say, each value once; the first three of many."""
+    """Return what the runs say, each value once; the first three of many."""
     values = list(dict.fromkeys(value(run) for run in runs))
     more = [f"and {len(values) - 3} more"] if len(values) > 3 else []
     return ", ".join(values[:3] + more)

@@ -128,7 +128,7 @@ def _gram(rows: Float32[np.ndarray, "row param"]) -> Float64[np.ndarray, "row ro
 def _path(
     gram: Float64[np.ndarray, "row row"],
 ) -> tuple[Float64[np.ndarray, "row 2"], Float64[np.ndarray, " 2"]]:
-    """Coordinates of phi_t - phi_0; each direction points to where the path goes."""
+    """Return coordinates of phi_t - phi_0; each direction points to where the path goes."""
     if not len(gram):
         return np.zeros((0, 2)), np.zeros(2)
     moved = gram - gram[:1] - gram[:, :1] + gram[0, 0]

@@ -63,7 +63,7 @@ _LICENCES = {
 
 
 def croissant(dataset: Dataset) -> str:
-    """``croissant.json`` of a complete data set.
+    """Return ``croissant.json`` of a complete data set.
 
     Raises:
         MissingExtraError: pyarrow is not installed.

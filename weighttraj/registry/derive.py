@@ -92,7 +92,7 @@ def combine(
     name: str | None = None,
     console: Console | None = None,
 ) -> Dataset:
-    """One data set of the runs of several, each in the split that it is in.
+    """Make one data set of the runs of several, each in the split that it is in.
 
     Where two runs have one id, every run gets the id of its data set before its own:
     ``walker-ppo-v1.seed0000``.
@@ -182,7 +182,7 @@ def split(
     name: str | None = None,
     console: Console | None = None,
 ) -> Dataset:
-    """The same runs, divided anew into training, validation and test, by run.
+    """Divide the runs of a data set again into training, validation and test, by run.
 
     Args:
         path: data set: path or id; a complete one.
@@ -229,7 +229,7 @@ def _complete(path: str | Path) -> Dataset:
 
 
 def _parts(count: int, fractions: Sequence[float]) -> list[str]:
-    """A part for each run, as close to the fractions as whole runs allow."""
+    """Return a part for each run, as close to the fractions as whole runs allow."""
     wanted = np.asarray(fractions, float)
     if (wanted < 0).any() or abs(wanted.sum() - 1) > 1e-6 or count < (wanted > 0).sum():
         raise RegistryError(

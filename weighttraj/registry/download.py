@@ -48,7 +48,7 @@ from weighttraj.tools.pack import cut
 from weighttraj.tools.repair import seal
 
 REQUEST = ".request.json"
-"""File in a download that is not whole yet: which part of the runs it is of."""
+"""File in an unfinished download: which part of the runs was asked for."""
 SOURCE = ".source.json"
 """File in a downloaded data set that says where it is from; no object of the data set."""
 _ODD = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
@@ -82,7 +82,7 @@ def download(
 
     Every file is compared with its hash in the manifest, every snapshot of a part with its digest.
     Stopped at any moment, the same call goes on with what is there; the data set appears under
-    its name when it is whole. A part of one is a data set of its own, which says what it is of.
+    its name when it is whole. A part becomes a data set of its own, which names the whole.
 
     Args:
         address: ``hf://org/name``, ``s3://bucket/prefix``, ``https://``...
@@ -179,7 +179,7 @@ def download_folder(
 
 
 def home() -> Path:
-    """Where data sets are put that are downloaded.
+    """Return where data sets are put that are downloaded.
 
     Raises:
         RegistryError: no folder is named for them, and the user has no home.
@@ -211,7 +211,7 @@ def name_of(place: RemotePath) -> str:
 
 
 def source_of(path: Path) -> Source | None:
-    """Where a data set on this machine was downloaded from; None: it was not."""
+    """Return where a data set on this machine was downloaded from; None: it was not."""
     try:
         return Source(**json.loads((path / SOURCE).read_bytes()))
     except (FileNotFoundError, NotADirectoryError, ValueError, TypeError):
@@ -219,7 +219,7 @@ def source_of(path: Path) -> Source | None:
 
 
 def _entries(dataset: Dataset) -> list[RunEntry]:
-    """The lines of the list of runs that are those of the runs opened."""
+    """Return the lines of the list of runs that are those of the runs opened."""
     ids = {run.id for run in dataset}
     return [entry for entry in dataset.info.runs if entry.id in ids]
 
@@ -337,7 +337,7 @@ def _append(
 
 
 def _is_of(line: ManifestLine, chosen: set[str]) -> bool:
-    """Whether a file is one of these runs, or lies in one that is a folder."""
+    """Return whether a file is one of these runs, or lies in one that is a folder."""
     path = PurePosixPath(line.path)
     return not chosen.isdisjoint(map(str, (path, *path.parents)))
 

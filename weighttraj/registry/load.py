@@ -69,7 +69,7 @@ def load_dataset(
 
 
 def _downloaded(place: RemotePath, revision: str | None, runs: Collection[str] | None) -> Dataset:
-    """What was brought here from an address.
+    """Return what was brought here from an address.
 
     Raises:
         FileNotFoundError: nothing was, or not these runs.

@@ -55,7 +55,7 @@ def local_datasets() -> list[LocalDataset]:
 
 
 def find(name: str) -> LocalDataset:
-    """A data set by its id here.
+    """Return a data set by its id here.
 
     Raises:
         FileNotFoundError: there is no such data set.
@@ -116,7 +116,7 @@ def delete(name: str) -> Path:
 
 
 def _names(folder: Path) -> Iterator[str]:
-    """Folders in a folder, and those in them that are no data sets themselves."""
+    """Yield folders in a folder, and those in them that are no data sets themselves."""
     for place in sorted(folder.iterdir()) if folder.is_dir() else ():
         if place.name.startswith(".") or not place.is_dir():
             continue
@@ -131,7 +131,7 @@ def _names(folder: Path) -> Iterator[str]:
 
 
 def _data(place: Path) -> Path | None:
-    """Where in a folder the data set lies, as ``locate`` finds it."""
+    """Return where in a folder the data set lies, as ``locate`` finds it."""
     for path in (place, place / "data"):
         if (path / DATASET).is_file():
             return path

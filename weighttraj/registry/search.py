@@ -22,7 +22,7 @@ def search(
     *,
     damaged: Callable[[WeightTrajError], object] | None = None,
 ) -> pd.DataFrame:
-    """Runs that fit a condition, over all data sets that are here.
+    """Return runs that fit a condition, over all data sets that are here.
 
     >>> search("env == 'HalfCheetah-v4' and final_return > 3000")  # doctest: +SKIP
 
@@ -77,7 +77,7 @@ def search(
 
 
 def _table(dataset: LocalDataset) -> pd.DataFrame:
-    """The runs of a data set. Columns that the format does not have are left out."""
+    """Return the runs of a data set. Columns that the format does not have are left out."""
     if not os.path.lexists(dataset.path / RUNS):  # one that is still being collected has no table
         table = runs_table(open_dataset(dataset.path))
     else:

@@ -237,7 +237,7 @@ def below(base: str, name: str) -> str:
 
 
 def _file_without_host(address: str) -> re.Match[str] | None:
-    """The parts of ``file:/folder``, which RFC 8089 has beside ``file:///folder``."""
+    """Return the parts of ``file:/folder``, which RFC 8089 has beside ``file:///folder``."""
     match = re.fullmatch(r"(file):(/.*)", address, re.DOTALL | re.IGNORECASE)
     return match if match is not None and not match[2].startswith("//") else None
 
@@ -312,7 +312,7 @@ def _of_hub(address: str, rest: str, revision: str | None, kind: str) -> RemoteP
 
 
 def _quoted_revision(revision: str) -> str:
-    """A revision as the hub's own client writes it in an address."""
+    """Return a revision as the hub's own client writes it in an address."""
     return revision if _SPECIAL.fullmatch(revision) else quote(revision, safe="")
 
 

@@ -127,7 +127,7 @@ def too_large(limit: int, got: int, where: str) -> RemoteError:
 
 
 def _explained(error: Exception, scheme: str, text: str, details: str) -> tuple[str, str]:
-    """What is wrong, and what to do."""
+    """Return what is wrong, and what to do."""
     from obstore import exceptions
 
     credentials = _CREDENTIALS.get(scheme, "give the server your credentials")

@@ -1,4 +1,4 @@
-"""Reads and writes objects at an address: S3 and its kin, HTTP, the hub, a folder elsewhere.
+"""Reads and writes objects at an address: S3 and similar stores, HTTP, the hub, a folder elsewhere.
 
 ``obstore`` does the work: requests, signatures, retries with growing pauses on 429, 5xx and broken
 connections. Here answers get a largest size and a longest time (``wait``), and errors of the client

@@ -35,7 +35,7 @@ class ManifestLine:
 
 
 def read_dataset_info(path: Path) -> DatasetInfo:
-    """The checked list of a data set's runs.
+    """Return the checked list of a data set's runs.
 
     Raises:
         FileNotFoundError: there is no data set at the path.
@@ -49,7 +49,7 @@ def read_dataset_info(path: Path) -> DatasetInfo:
 
 
 def parse_dataset(content: bytes, where: object) -> DatasetInfo:
-    """The list of runs in ``dataset.json``; raises as ``read_dataset_info`` does."""
+    """Return the list of runs in ``dataset.json``; raises as ``read_dataset_info`` does."""
     document = load_json(content, where)
     stored = document.pop("sha256", None) if isinstance(document, dict) else None
     info = parse(document, DatasetInfo, where)
@@ -58,7 +58,7 @@ def parse_dataset(content: bytes, where: object) -> DatasetInfo:
 
 
 def dataset_document(info: DatasetInfo) -> bytes:
-    """``dataset.json`` with its checksum."""
+    """Return ``dataset.json`` with its checksum."""
     document = to_json(info)
     return json.dumps(document | {"sha256": checksum(document)}, indent=1).encode()
 
@@ -109,7 +109,7 @@ def read_manifest(path: Path) -> list[ManifestLine]:
 
 
 def parse_manifest(content: bytes | None, where: object) -> list[ManifestLine]:
-    """Lines of a manifest.
+    """Return lines of a manifest.
 
     Args:
         content: of the file; None: there is none.
@@ -160,7 +160,7 @@ def parse_manifest(content: bytes | None, where: object) -> list[ManifestLine]:
 def check_manifest(
     path: Path, shown: Callable[[list[ManifestLine]], Iterable[ManifestLine]] = iter
 ) -> list[str]:
-    """Objects that are missing, changed or not in the manifest, in words.
+    """Return objects that are missing, changed or not in the manifest, in words.
 
     Args:
         path: of the data set.
@@ -186,7 +186,7 @@ def check_manifest(
 
 
 def _objects(path: Path) -> Iterator[str]:
-    """Every object of a data set but the manifest; drafts and locks are none."""
+    """Yield every object of a data set but the manifest; drafts and locks are none."""
     for folder, folders, files in os.walk(path):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for name in files:

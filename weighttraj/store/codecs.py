@@ -203,7 +203,7 @@ def check_grid(document: dict[str, Any]) -> None:
 def unshard(
     codecs: list[dict[str, Any]], outer: tuple[int, ...]
 ) -> tuple[list[dict[str, Any]], tuple[int, ...], bool]:
-    """The codec chain of a chunk, its shape, and whether chunks lie in shards (index first).
+    """Return the codec chain of a chunk, its shape, and whether chunks lie in shards (index first).
 
     Raises:
         FormatError: they lie in other shards than the format has.
@@ -226,14 +226,14 @@ def unshard(
 
 @contextmanager
 def quiet_codecs() -> Iterator[None]:
-    """Without Zarr's warning that PCodec is in no specification: FORMAT.md says so."""
+    """Silence Zarr's warning that PCodec is in no specification: FORMAT.md says so."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Numcodecs codecs are not in", ZarrUserWarning)
         yield
 
 
 def _packed_chunk(spec: ArraySpec, rows: int, by_column: bool) -> tuple[int, ...]:
-    """Shape of a chunk of about 4 MiB: as many rows as fit, all but large rows whole."""
+    """Return the shape of a chunk of about 4 MiB: as many rows as fit, all but large rows whole."""
     itemsize = np.dtype(spec.dtype).itemsize
     most = PACKED_CHUNK_BYTES // itemsize
     if len(spec.inner) == 1:

@@ -28,7 +28,7 @@ _WHOLE_BYTES = BLOCK_BYTES
 a single row, or are old: their chunks are read one by one."""
 
 GROWING = "--------"
-"""In place of the crc32c of a chunk that is not full while its run is collected."""
+"""Stands for the crc32c of a chunk that is not full while its run is collected."""
 
 
 class RowDecoder:
@@ -106,7 +106,7 @@ class RowDecoder:
         return out
 
     def _tag(self, corner: tuple[int, ...]) -> str:
-        """The crc32c that the chunk has by the run's metadata, hexadecimal."""
+        """Return the crc32c that the chunk has by the run's metadata, hexadecimal."""
         axis = len(self._shape) - 1 if self._by_column else 0
         counts = [-(-n // c) for n, c in zip(self._shape, self._chunk, strict=True)]
         place = [k // c for k, c in zip(corner, self._chunk, strict=True)]
@@ -121,7 +121,7 @@ class RowDecoder:
             return np.empty(shape, self._dtype)
 
     def _require(self, parts: list[range]) -> None:
-        """Every chunk must be there before memory for them is taken."""
+        """Check that every chunk exists before memory is allocated."""
         for index in grid(parts):
             if self._objects.size(self._key(index)) is None:
                 raise self._missing(index)
@@ -159,7 +159,7 @@ class RowDecoder:
         return int(2 * math.prod(self._outer) * self._dtype.itemsize) + _OVERHEAD
 
     def _bytes(self, index: tuple[int, ...], start: int, stop: int) -> bytes:
-        """The bytes of an object that must be there, or some of them."""
+        """Return the bytes of an object that must be there, or some of them."""
         content = self._objects.read(self._key(index), start, stop)
         if content is None:
             raise self._missing(index)
@@ -241,7 +241,7 @@ class RowDecoder:
 
 
 def grid(parts: list[range]) -> Iterator[tuple[int, ...]]:
-    """As ``itertools.product``, which would make lists of the ranges first."""
+    """Yield what ``itertools.product`` does, which would make lists of the ranges first."""
     for i in parts[0]:
         yield from ((i, *rest) for rest in grid(parts[1:])) if parts[1:] else [(i,)]
 

@@ -115,7 +115,7 @@ class ObjectEncoder:
 
 
 def _tag_of(file: BinaryIO, length: int) -> str:
-    """The crc32c of the chunk that is read next, if it is right."""
+    """Return the crc32c of the chunk that is read next, if it is right."""
     chunk = file.read(length)
     return chunk[-4:].hex() if _crc(chunk[:-4]) == chunk[-4:] else "damaged"
 

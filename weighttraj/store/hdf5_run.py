@@ -103,7 +103,7 @@ class H5RunStore:
             return self._read(self.specs[name], rows, (slice(None), *rest))
 
     def chunk_rows(self, name: str) -> int:
-        """Rows of an array that are decoded together."""
+        """Return rows of an array that are decoded together."""
         return self._blocks[name].rows
 
     def _read(self, spec: ArraySpec, rows: Any, columns: tuple[Any, ...]) -> np.ndarray:
@@ -155,7 +155,7 @@ class H5RunStore:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file, open for a moment; what HDF5 raises meanwhile is damage.
+    """Open an HDF5 file for a moment; whatever HDF5 raises meanwhile is damage.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -183,12 +183,12 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def exists(root: h5py.File, name: str) -> bool:
-    """Whether there is such an object; raises FormatError if a link leads to it."""
+    """Return whether there is such an object; raises FormatError if a link leads to it."""
     return _located(root, name) is not None
 
 
 def read_document(root: h5py.File, name: str, where: str) -> bytes:
-    """A fixed-length byte string; its size is known before it is read.
+    """Return a fixed-length byte string; its size is known before it is read.
 
     Raises:
         FormatError: it is something else, too large, or lies outside the file.
@@ -212,12 +212,12 @@ def read_document(root: h5py.File, name: str, where: str) -> bytes:
 
 
 def sha256(values: np.ndarray) -> str:
-    """Hash of an array's values in C order, little-endian; hexadecimal."""
+    """Return the hash of an array's values in C order, little-endian; hexadecimal."""
     return hashlib.sha256(values.astype(values.dtype.newbyteorder("<")).tobytes()).hexdigest()
 
 
 def _parse(document: Any, where: str) -> tuple[RunInfo, dict[str, Blocks]]:
-    """The checked metadata of a run and of its arrays."""
+    """Return the checked metadata of a run and of its arrays."""
     plain = document if isinstance(document, dict) else {}
     stored = plain.pop("sha256", None)
     info = parse(plain.get(ATTRIBUTE), RunInfo, where)
@@ -299,7 +299,7 @@ def _dataset(root: h5py.File, name: str) -> h5py.h5d.DatasetID:
 
 
 def _located(root: h5py.File, name: str) -> Any:
-    """The HDF5 object of a name, reached by hard links only; None: there is none."""
+    """Return the HDF5 object of a name, reached by hard links only; None: there is none."""
     found = h5py.h5g.open(root.id, b"/")
     for part in check_name(name, root.filename).split("/"):
         if not isinstance(found, h5py.h5g.GroupID) or not found.links.exists(part.encode()):

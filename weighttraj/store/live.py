@@ -130,7 +130,7 @@ class LiveStore(RunStore):
         self._unsynced |= self._files(name, start, start + len(rows))
 
     def _key(self, name: str, chunk: int, others: tuple[int, ...] = ()) -> str:
-        """The object of some rows of an array; others: its place along the other axes."""
+        """Return the object of some rows of an array; others: its place along the other axes."""
         index = [chunk, *(others or (0,) * len(self.specs[name].inner))]
         index = index[1:] + index[:1] if self._by_column(name) else index
         return "/".join([name, "c", *map(str, index)])
@@ -180,7 +180,7 @@ class LiveStore(RunStore):
                 )
 
     def _slabs(self, name: str, values: np.ndarray) -> Iterator[tuple[slice, ...]]:
-        """Columns of whole chunks that Zarr writes at a time: it holds ten times as much."""
+        """Yield columns of whole chunks that Zarr writes at a time: it holds ten times as much."""
         inner = self.specs[name].inner
         if not inner:
             yield ()
@@ -214,7 +214,7 @@ class LiveStore(RunStore):
         self.write_members()
 
     def _final(self, name: str, tags: str, document: dict[str, Any], info: RunInfo) -> str:
-        """Checksums of the committed chunks that will not change.
+        """Return the checksums of the committed chunks that will not change.
 
         A partly filled chunk is written again when it grows, before the commit that says so: a
         writer killed in between must not leave another chunk than was committed.
@@ -236,7 +236,7 @@ class LiveStore(RunStore):
                 replace_file(self.path / name, content, root=self.path, durable=durable)
 
     def _files(self, name: str, start: int, stop: int) -> set[Path]:
-        """Files and folders that hold some rows of an array."""
+        """Return files and folders that hold some rows of an array."""
         folder = self.path / name
         if not self._by_column(name):
             size = self.chunk_rows(name)
@@ -343,7 +343,7 @@ def _open_array(store: Any, name: str, mode: Any, where: str) -> zarr.Array[Any]
 
 
 def lock_run(path: Path) -> FileLock:
-    """The lock of a run, held: it has one writer.
+    """Acquire the lock of a run, which has one writer.
 
     Raises:
         StoreLockedError: another process holds it.

@@ -42,16 +42,16 @@ class Objects(Protocol):
         """Folder or file that holds them."""
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> bytes | None:
-        """Bytes of an object, or a range of them; a negative start counts from the end.
+        """Return bytes of an object, or a range of them; a negative start counts from the end.
 
         Returns None if there is no such object.
         """
 
     def size(self, name: str) -> int | None:
-        """Bytes of an object; None: there is no such object."""
+        """Return bytes of an object; None: there is no such object."""
 
     def expect(self, names: Sequence[str]) -> None:
-        """These will be read next, in this order: what is far away fetches them together."""
+        """Announce what is read next, in this order, so that a remote store fetches it together."""
 
 
 @runtime_checkable
@@ -67,10 +67,10 @@ class Blob(Protocol):
         """How many bytes it has."""
 
     def read(self, start: int, stop: int) -> bytes:
-        """Some of them."""
+        """Return some of its bytes."""
 
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:
-        """These bytes, from start to stop, will be read next, in this order."""
+        """Announce which bytes, from start to stop, are read next, in this order."""
 
 
 class FileBlob:
@@ -234,7 +234,7 @@ class ZipObjects:
         return self._members[name][1] if name in self._members else None
 
     def _start(self, name: str) -> int:
-        """Where the bytes of an object begin: its own header says how long that is."""
+        """Return where the bytes of an object begin: its own header says how long that is."""
         if name not in self._starts:
             offset, size = self._members[name]
             header = self._blob.read(offset, offset + 30)
@@ -331,7 +331,7 @@ def fitting_memory(where: object) -> Iterator[None]:
 
 
 def replaced(where: object) -> FormatError:
-    """The error for a packed run that is not the one any more that was opened."""
+    """Return the error for a packed run that is not the one any more that was opened."""
     return FormatError(
         "the packed run was replaced after it was opened",
         where=where,
@@ -378,7 +378,7 @@ def write_zip(path: Path, members: Iterable[tuple[str, Path | ZipObjects]]) -> N
 
 
 def _pieces(name: str, source: Path | ZipObjects) -> Iterator[bytes]:
-    """The bytes of a file or member, some at a time."""
+    """Yield the bytes of a file or member, some at a time."""
     if isinstance(source, ZipObjects):
         for start in range(0, source.size(name) or 0, _PIECE_BYTES):
             yield source.read(name, start, start + _PIECE_BYTES) or b""
@@ -430,5 +430,5 @@ def _read_range(handle: int, size: int, start: int, stop: int | None) -> bytes:
 
 
 def packed_order(name: str) -> tuple[bool, bool, str]:
-    """Sorts the objects of a packed run: the metadata first, then the chunks by name."""
+    """Sort key of the objects of a packed run: the metadata first, then the chunks by name."""
     return name != "zarr.json", not name.endswith("zarr.json"), name

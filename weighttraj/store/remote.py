@@ -23,7 +23,7 @@ KEPT_BYTES = 64 << 20
 
 
 def remote_objects(path: RemotePath) -> ZipObjects | RemoteFolder:
-    """The objects of a run at an address: a packed one by its name, else a folder.
+    """Return the objects of a run at an address: a packed one by its name, else a folder.
 
     Raises:
         FileNotFoundError: there is no run at the address.
@@ -109,7 +109,7 @@ class RemoteBlob:
 
 
 class RemoteFolder:
-    """Objects that are those below a prefix."""
+    """Objects below a prefix of an object store."""
 
     def __init__(self, path: RemotePath) -> None:
         self.path = path

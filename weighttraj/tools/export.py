@@ -55,7 +55,7 @@ def export_safetensors(run: Run, t: int, path: str | Path) -> Path:
 
     Each parameter is a float32 tensor under its own name; the normalisers' statistics are float64
     tensors under the names they have in the run, ``obs_norm/mean`` and so on. The metadata are
-    strings: ``run_id``, ``t``, ``num_timesteps``, ``env_id`` (empty: not said), and as JSON
+    strings: ``run_id``, ``t``, ``num_timesteps``, ``env_id`` (empty: not recorded), and as JSON
     ``policy`` and ``obs_norm``, what is fixed about them.
 
     Args:

@@ -105,7 +105,7 @@ def import_hdf5(file: str | Path, out: str | Path) -> Path:
 
 
 def _contents(source: Dataset | Run | str | Path) -> tuple[list[Run], DatasetInfo]:
-    """The runs to be exported, and the list of them."""
+    """Return the runs to be exported, and the list of them."""
     if isinstance(source, str | Path):
         source = open_dataset(source)
     if isinstance(source, Run):
@@ -150,7 +150,7 @@ def _put_array(group: h5py.Group, spec: ArraySpec, array: StoredArray) -> dict[s
 
 
 def _chunk(spec: ArraySpec, n: int) -> tuple[int, tuple[int, ...]]:
-    """Rows and columns of a chunk: about 4 MiB of whole rows, or a part of one row.
+    """Return rows and columns of a chunk: about 4 MiB of whole rows, or a part of one row.
 
     Rows are not cut as they are in Zarr: a block is checked as a whole, so it must be small.
     """

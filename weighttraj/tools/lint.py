@@ -1,4 +1,4 @@
-"""Is a run what it says it is? Looks for what is whole, byte by byte, and yet suspicious."""
+"""Looks for what is suspicious about runs whose bytes are whole."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Finding:
 
 
 def lint(path: str | Path, *, console: Console | None = None) -> list[Finding]:
-    """What is suspicious about a data set or run; an empty list means nothing.
+    """Return what is suspicious about a data set or run; an empty list means nothing.
 
     Checks: ``duplicate`` (snapshots that equal another one), ``final`` (snapshots that equal the
     last one, as when a mirror serves final weights under every name), ``gap`` (counters that do
@@ -65,7 +65,7 @@ def lint(path: str | Path, *, console: Console | None = None) -> list[Finding]:
 
 
 def lint_run(run: Run) -> list[Finding]:
-    """What is suspicious about one run."""
+    """Return what is suspicious about one run."""
     if not len(run):
         return [Finding(check="short", run=run.id, message="no snapshots")]
     checks = (_start, _duplicates, _counters, _weights, _normalizer, _returns)
@@ -156,7 +156,7 @@ def _behind_silent_inputs(run: Run) -> np.ndarray:
 
 
 def _jumps(lengths: np.ndarray) -> list[int]:
-    """Snapshots that end a step far longer than the median of its surroundings."""
+    """Return snapshots that end a step far longer than the median of its surroundings."""
     found = []
     for t, length in enumerate(lengths):
         around = lengths[max(0, t - AROUND) : t + AROUND + 1]
@@ -175,7 +175,7 @@ def _normalizer(run: Run) -> Iterator[tuple[str, str]]:
 
 
 def _continued(runs: Sequence[Run]) -> Iterator[Finding]:
-    """Runs of one training that are taken for independent ones."""
+    """Yield runs of one training that are taken for independent ones."""
     by_id = {run.id: run for run in runs}
     for run in runs:
         origin = run.info.continues
@@ -193,7 +193,7 @@ def _continued(runs: Sequence[Run]) -> Iterator[Finding]:
 
 
 def lint_returns(run: Run) -> list[Finding]:
-    """What is suspicious about the returns of one run."""
+    """Return what is suspicious about the returns of one run."""
     return [Finding(check=check, run=run.id, message=said) for check, said in _returns(run)]
 
 

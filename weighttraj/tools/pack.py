@@ -114,7 +114,7 @@ def cut(
 
 
 def _without(info: RunInfo, groups: Collection[str]) -> RunInfo:
-    """The metadata of a run that lacks some groups of arrays."""
+    """Return the metadata of a run that lacks some groups of arrays."""
     return replace(
         info,
         critic_layout=None if "critic" in groups else info.critic_layout,
@@ -169,7 +169,7 @@ def copy_packed(path: Path, out: Path, run_id: str) -> None:
 
 
 def same_as_packed(path: Path) -> bool:
-    """Whether a packed run is, to the last byte, what packing its own members gives.
+    """Return whether a packed run is, to the last byte, what packing its own members gives.
 
     So every byte counts, also those of the zip file's directory that no reader looks at.
     """
@@ -192,7 +192,7 @@ def unpacked(path: Path) -> Iterator[Path]:
 
 
 def _members(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Files of a run in a fixed order, its metadata first."""
+    """Yield files of a run in a fixed order, its metadata first."""
     files = {f.relative_to(folder).as_posix(): f for f in folder.rglob("*") if f.is_file()}
     for name in sorted(files, key=packed_order):
         yield name, files[name]

@@ -66,7 +66,7 @@ def repair(path: str | Path, *, cut: bool = False) -> list[str]:
 
     Metadata of arrays are written again from the run's checked metadata, rows that were never
     committed and drafts of killed writers are removed, and the tables and manifest of a data set
-    whose runs are whole are written anew.
+    whose runs are whole are written again.
 
     Args:
         path: data set or run.
@@ -197,7 +197,7 @@ def _sweep(store: LiveStore) -> None:
 
 
 def _whole_rows(store: RunStore, axis: Axis) -> int:
-    """Rows before the first damaged one, in whole blocks; returns can be got again."""
+    """Return rows before the first damaged one, in whole blocks; returns can be got again."""
     n, block = store.info.committed(axis), store.info.block
     specs = [s for s in store.specs.values() if s.axis == axis and s.name not in RETURNS]
     for start in range(0, n, block):

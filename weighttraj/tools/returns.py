@@ -1,4 +1,4 @@
-"""Adds the returns of its snapshots to a finished run; all else in the run stays as it is."""
+"""Stores the returns of snapshots in a finished run; everything else stays as it is."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def store_returns(
 ) -> None:
     """Store what the snapshots of a finished run returned in episodes.
 
-    A packed run is written anew beside the old file, its other objects byte for byte, and takes
+    A packed run is written again beside the old file, its other objects byte for byte, and takes
     its place in one atomic replace; returns that it has are replaced. Into a folder the arrays
     are added; what it has stays.
 
@@ -67,7 +67,7 @@ def store_returns(
 
 
 def drop_returns(store: RunStore) -> None:
-    """Take the returns out of a run, damaged ones too; the caller holds the run's lock.
+    """Remove the returns from a run, also damaged ones; the caller holds the run's lock.
 
     Objects that no metadata names any more stay in a folder.
 
@@ -82,14 +82,14 @@ def drop_returns(store: RunStore) -> None:
 
 
 def locked_path(path: Path) -> Path:
-    """The path whose lock is a run's: that of the folder, also when it is packed."""
+    """Return the path whose lock is a run's: that of the folder, also when it is packed."""
     return path.with_name(path.name.removesuffix(PACKED))
 
 
 def _checked(
     store: RunStore, evaluation: Evaluation, returns: np.ndarray, lengths: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The arrays as they are stored, by name."""
+    """Return the arrays as they are stored, by name."""
     if store.info.status == "collecting":
         raise FormatError(
             "returns are stored in a finished run only",
@@ -137,7 +137,7 @@ def _check_values(returns: np.ndarray, lengths: np.ndarray, where: object) -> No
 
 
 def _has_already(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]) -> bool:
-    """Whether a folder has these very returns.
+    """Return whether a folder has these very returns.
 
     Raises:
         FormatError: it has others. A chunk cannot be replaced together with its checksum, which
@@ -168,7 +168,7 @@ def _write_folder(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarra
 
 
 def _write_file(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]) -> None:
-    """Write a packed run anew: with these returns, or with none."""
+    """Write a packed run again: with these returns, or with none."""
     path = Path(store.path)
     with appearing(path, replace=True) as draft:
         live = _new_objects(draft.with_name(f"{draft.name}.folder"), store, info, values)
@@ -181,7 +181,7 @@ def _write_file(store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]
 def _new_objects(
     folder: Path, store: RunStore, info: RunInfo, values: Mapping[str, np.ndarray]
 ) -> LiveStore:
-    """A folder of what the packed run is to have anew: arrays, and the metadata that name them."""
+    """Make a folder of the new objects of a packed run: arrays and the metadata that name them."""
     rows: dict[str, int] = {axis: info.committed(axis) for axis in AXES}
     documents = _documents(folder, info, rows) if values else {}
     live = LiveStore(FolderObjects(folder), _metadata(store, info, documents))
@@ -195,7 +195,7 @@ def _new_objects(
 
 
 def _documents(folder: Path, info: RunInfo, packed_rows: dict[str, int] | None) -> Documents:
-    """Zarr metadata of the arrays, with the rows that they will have."""
+    """Return Zarr metadata of the arrays, with the rows that they will have."""
     documents = empty_arrays(folder, info, RETURNS, packed_rows)
     for document in documents.values():
         document["shape"][document["dimension_names"].index("time")] = info.n_committed
@@ -221,7 +221,7 @@ def _write_arrays(live: LiveStore, values: Mapping[str, np.ndarray]) -> None:
 
 
 def _kept(source: ZipObjects, old: Documents, new: Documents) -> list[str]:
-    """Names of objects that stay: no returns, and no metadata that name them."""
+    """Return names of objects that stay: no returns, and no metadata that name them."""
     returns = tuple(f"{name}/" for name in RETURNS)
     gone = {"zarr.json", *(member_documents(old).keys() - member_documents(new).keys())}
     return [n for n in source.names if n not in gone and not n.startswith(returns)]

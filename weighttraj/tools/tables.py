@@ -61,7 +61,7 @@ def write_tables(dataset: Dataset) -> None:
 
 
 def runs_table(dataset: Dataset) -> pa.Table:
-    """The table of runs, one row each.
+    """Return the table of runs, one row each.
 
     A seed or hyper-parameter has the type of its values: truth values, 64-bit integers, or floats,
     which hold integers too. Where the values have several kinds, or do not fit, it is text.
@@ -89,14 +89,14 @@ def snapshots_table(dataset: Dataset) -> pa.Table:
 
 
 def _snapshot_columns(run: Run) -> dict[str, Any]:
-    """The columns of one run: norms of the weights too, masked values for nulls."""
+    """Return the columns of one run: norms of the weights too, masked values for nulls."""
     columns = snapshot_columns(run)
     means = {n: np.ma.masked_invalid(columns.pop(n)) for n in MEAN_RETURNS}
     return {"run_id": [run.id] * len(run), **columns, **step_sizes(run), **means}
 
 
 def _free(values: list[Any], otherwise: str) -> pa.Array:
-    """A column of values of any kind.
+    """Return a column of values of any kind.
 
     >>> _free([1, 0.5], "int64").to_pylist(), _free(["auto", 0.5], "int64").to_pylist()
     ([1.0, 0.5], ['auto', '0.5'])
@@ -117,7 +117,7 @@ def _free(values: list[Any], otherwise: str) -> pa.Array:
 
 
 def _is_exact(value: int | float) -> bool:
-    """Whether a float holds a number exactly."""
+    """Return whether a float holds a number exactly."""
     return isinstance(value, float) or (abs(value) < 2**1023 and int(float(value)) == value)
 
 
@@ -216,7 +216,7 @@ def _checked(stored: pq.ParquetFile, rows: int, limit: int) -> list[str]:
 
 
 def _decoded(table: pa.Table, name: str, limit: int) -> pa.Table:
-    """A table with a column of text as plain text.
+    """Return a table with a column of text as plain text.
 
     Raises:
         ValueError: that would be too large.

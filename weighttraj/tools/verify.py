@@ -59,7 +59,7 @@ def verify(path: str | Path, *, deep: bool = False, console: Console | None = No
 
 
 def check_manifest_quietly(path: Path, shown: Callable[..., Any] = iter) -> list[str]:
-    """Problems of the manifest, also when it cannot be read."""
+    """Return problems of the manifest, also when it cannot be read."""
     try:
         return check_manifest(path, shown)
     except WeightTrajError as error:
@@ -107,7 +107,7 @@ def _verify_arrays(run: Run, *, deep: bool) -> Iterator[str]:
 
 
 def _verify_objects(store: RunStore) -> Iterator[str]:
-    """Objects that are missing or strange, and metadata that are not as they were written."""
+    """Yield objects that are missing or strange, and metadata that are not as they were written."""
     text = read_document(store.objects, "zarr.json", MAX_METADATA) or b""
     if json.dumps(json.loads(text), indent=1).encode() != text:
         yield f"{store.path}, zarr.json: not in the form in which it was written"
@@ -162,13 +162,13 @@ def _verify_array(name: str, array: StoredArray, *, where: str) -> Iterator[str]
 
 
 def _chunk_keys(store: RunStore, name: str) -> Iterator[str]:
-    """Names of all chunks of an array's committed rows."""
+    """Yield names of all chunks of an array's committed rows."""
     for index in itertools.product(*map(range, object_grid(store.documents[name]))):
         yield "/".join([name, "c", *map(str, index)])
 
 
 def is_chunk(store: RunStore, name: str) -> bool:
-    """Whether an object is a chunk of committed rows."""
+    """Return whether an object is a chunk of committed rows."""
     array, _, index = name.rpartition("/c/")
     if array not in store.documents or re.fullmatch(r"\d{1,18}(/\d{1,18})*", index) is None:
         return False
