@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 from filelock import FileLock, Timeout
 
-from weighttraj.errors import FormatError, StoreExistsError
+from weighttraj.errors import FormatError, StoreExistsError, StoreLockedError
 from weighttraj.remote.address import new_path
 
 DRAFT = ".draft"
@@ -191,6 +191,19 @@ def lock_of(path: Path) -> FileLock:
     if path.is_dir():
         raise _misplaced(path, "a folder")
     return FileLock(path)
+
+
+def acquired(lock: FileLock, what: str, *, where: object, do: str) -> FileLock:
+    """Return a lock that is held now.
+
+    Raises:
+        StoreLockedError: another process holds it; the other arguments say so.
+    """
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise StoreLockedError(what, where=where, do=do) from error
+    return lock
 
 
 def refuse_existing(path: Path, do: str = "choose another path, or delete it") -> None:

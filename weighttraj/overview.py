@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from weighttraj.errors import WeightTrajError
 from weighttraj.format.schema import DatasetInfo, Evaluation
+from weighttraj.store.objects import bytes_in
 from weighttraj.text import printable
 
 Row = tuple[str, str]
@@ -96,5 +97,4 @@ def _size(path: Any) -> str:
     """Return the size of a data set on this machine; empty where it lies elsewhere."""
     if not isinstance(path, Path):
         return ""
-    files = [path] if path.is_file() else [f for f in path.rglob("*") if f.is_file()]
-    return f"{sum(file.stat().st_size for file in files) / 1e6:,.1f} MB"
+    return f"{bytes_in(path) / 1e6:,.1f} MB"

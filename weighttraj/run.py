@@ -370,7 +370,8 @@ class Run:
         """Load the weights of snapshot t, and its observation normaliser, into your own model.
 
         This works for every policy, also for those that ``load_policy`` cannot rebuild. Either
-        everything is loaded or nothing. The critic is loaded if the run stores it. Needs the extra
+        everything is loaded or nothing. The critic is loaded if the run stores it and the target
+        has it. The optimizer and statistics of rewards are left as they are. Needs the extra
         ``sb3``.
 
         Args:

@@ -26,25 +26,7 @@ Target = BaseAlgorithm | nn.Module | Mapping[str, Tensor]
 def load_into(
     run: Run, target: Target, t: int = -1, *, normalizer: bool = True, keep_buffers: bool = False
 ) -> None:
-    """Load the weights of snapshot t, and its observation normaliser, into a model.
-
-    Either everything is loaded or nothing. The critic is loaded if the run stores it and the target
-    has it. The optimizer is left as it is, and so are statistics of rewards.
-
-    Args:
-        run: the run.
-        target: a Stable-Baselines3 model, whose environment holds the normaliser; a module; or
-            tensors by name. Names, shapes and types must be those of ``run.layout``.
-        t: snapshot, from 0; below 0 it counts from the end.
-        normalizer: load the statistics of the observation normaliser too. False: leave that of the
-            target alone.
-        keep_buffers: accept a target with buffers, such as the statistics of a batch normalisation.
-            No run stores them: they stay as they are.
-
-    Raises:
-        PolicyError: the target is another network, or has another normaliser; nothing was changed.
-        IndexError: there is no such snapshot.
-    """
+    """Do what ``Run.load_into`` says."""
     module = target.policy if isinstance(target, BaseAlgorithm) else target
     stored = _stored(run, t)
     tensors: dict[str, Tensor] = {

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import re
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,15 +63,9 @@ class Recipe:
         Raises:
             RecipeError: there cannot; all that is wrong is said at once.
         """
-        try:
-            msgspec.convert(dataclasses.asdict(self), Recipe)
-        except (ValueError, OverflowError) as error:
-            raise RecipeError(
-                "the recipe has a value of the wrong type",
-                got=error,
-                where=where or f"recipe {self.id!r}",
-            ) from error
-        _refuse(self.problems(), where or f"recipe {self.id!r}")
+        where = where or f"recipe {self.id!r}"
+        _convert(dataclasses.asdict(self), lambda _: where)
+        _refuse(self.problems(), where)
 
     def problems(self) -> list[Problem]:
         """Return everything that is wrong with the values, if their types are right."""
@@ -95,17 +90,22 @@ def read_recipe(path: str | Path) -> Recipe:
     ppo = document.get("ppo")
     if isinstance(ppo, dict) and ppo.get("clip_range_vf") is False:
         ppo["clip_range_vf"] = None  # TOML has no null
+    recipe = _convert(document, lambda key: _place(path, text, key))
+    _refuse(recipe.problems(), path, text)
+    return recipe
+
+
+def _convert(document: dict[str, Any], where: Callable[[str], object]) -> Recipe:
+    """Return a recipe whose values have the right types; where: the place of a key, for errors."""
     try:
-        recipe = msgspec.convert(document, Recipe)
+        return msgspec.convert(document, Recipe)
     except (ValueError, OverflowError) as error:
         key = re.search(r"\$\.([\w.]+)", str(error))
         raise RecipeError(
             "the recipe has a value of the wrong type",
             got=error,
-            where=_place(path, text, key[1] if key else ""),
+            where=where(key[1] if key else ""),
         ) from error
-    _refuse(recipe.problems(), path, text)
-    return recipe
 
 
 def _refuse(problems: list[Problem], where: object, text: str = "") -> None:

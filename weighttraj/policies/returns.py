@@ -20,7 +20,6 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from filelock import Timeout
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -30,10 +29,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from weighttraj.atomic import appending, lock_of, refuse_link, replace_file
+from weighttraj.atomic import acquired, appending, lock_of, refuse_link, replace_file
 from weighttraj.dataset import Dataset
 from weighttraj.engine import Engine, Tell, engine_of
-from weighttraj.errors import PolicyError, StoreLockedError
+from weighttraj.errors import PolicyError
 from weighttraj.format import Evaluation
 from weighttraj.learning import learning_phase
 from weighttraj.opening import open_dataset, open_run
@@ -511,15 +510,12 @@ def _seldom(tell: Tell) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def _only_one(path: Path) -> Iterator[None]:
-    lock = lock_of(path.with_name(f".{path.name}.lock"))  # as who collects into it
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise StoreLockedError(
-            "another process is changing this data set",
-            where=path,
-            do="wait for its collection or evaluation to end, or stop it",
-        ) from error
+    lock = acquired(
+        lock_of(path.with_name(f".{path.name}.lock")),  # the one that a collection holds
+        "another process is changing this data set",
+        where=path,
+        do="wait for its collection or evaluation to end, or stop it",
+    )
     try:
         yield
     finally:

@@ -15,6 +15,7 @@ from weighttraj.opening import open_dataset, open_run
 from weighttraj.publish.curves import final_return
 from weighttraj.remote.address import here
 from weighttraj.run import Run
+from weighttraj.store.objects import bytes_in
 
 MINUS, DASH = "\u2212", "\u2013"
 
@@ -76,7 +77,7 @@ def facts(source: Source) -> Facts:
         ("a snapshot", _values(runs, _cadence)),
         ("status", _status(source)),
         ("profile", _values(runs, lambda r: r.info.profile)),
-        ("size on disk", size(_bytes(source.path))),
+        ("size on disk", size(bytes_in(source.path))),
     ]
     if source.info is not None:
         found.append(("data version", f"{source.info.version}, {source.info.licence}"))
@@ -192,9 +193,3 @@ def _versions(runs: Iterable[Run]) -> str:
         return ", ".join(f"{name} {v}" for name, v in run.info.provenance.packages.items())
 
     return _values(runs, versions)
-
-
-def _bytes(path: Path) -> int:
-    if path.is_file():
-        return path.stat().st_size
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())

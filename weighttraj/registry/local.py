@@ -14,6 +14,7 @@ from weighttraj.format import DatasetInfo
 from weighttraj.locate import clone, folders, locate
 from weighttraj.opening import open_dataset
 from weighttraj.store.catalog import DATASET, read_dataset_info
+from weighttraj.store.objects import bytes_in
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class LocalDataset:
     @property
     def size(self) -> int:
         """Bytes of all its files."""
-        return sum(file.stat().st_size for file in self.path.rglob("*") if file.is_file())
+        return bytes_in(self.path)
 
 
 def local_datasets() -> list[LocalDataset]:

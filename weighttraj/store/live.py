@@ -12,13 +12,21 @@ from typing import Any
 
 import numpy as np
 import zarr
-from filelock import FileLock, Timeout
+from filelock import FileLock
 from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from weighttraj.atomic import DRAFT, drafting, lock_of, refuse_existing, replace_file, sync
-from weighttraj.errors import DamageError, FormatError, StoreLockedError
+from weighttraj.atomic import (
+    DRAFT,
+    acquired,
+    appearing,
+    lock_of,
+    refuse_existing,
+    replace_file,
+    sync,
+)
+from weighttraj.errors import DamageError, FormatError
 from weighttraj.format.schema import AXES, RunInfo, arrays_of
 from weighttraj.remote.address import Place
 from weighttraj.store.codecs import create_array, quiet_codecs, rows_in_block
@@ -79,15 +87,12 @@ class LiveStore(RunStore):
         refuse_existing(path, "choose another path, delete it, or continue with resume=True")
         if packed_rows is None:
             info = replace(info, block=_block(info))
-        with drafting(path) as folder:
-            draft = folder / path.name
+        with appearing(path) as draft:
             documents = empty_arrays(draft, info, list(arrays_of(info)), packed_rows)
             tags = dict.fromkeys(documents, "")
             store = cls(FolderObjects(draft), Metadata(info=info, documents=documents, tags=tags))
             store.commit(info)
             _check_readable(store)
-            draft.rename(path)
-        sync(path.parent)
         store.objects = FolderObjects(path)
         return store
 
@@ -349,13 +354,9 @@ def lock_run(path: Path) -> FileLock:
         StoreLockedError: another process holds it.
         FormatError: its file is a link.
     """
-    lock = lock_of(path.with_name(path.name + ".lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        raise StoreLockedError(
-            "another process is writing this run",
-            where=path,
-            do="wait for it or stop it; a lock of a dead process frees itself",
-        ) from error
-    return lock
+    return acquired(
+        lock_of(path.with_name(path.name + ".lock")),
+        "another process is writing this run",
+        where=path,
+        do="wait for it or stop it; a lock of a dead process frees itself",
+    )

@@ -312,6 +312,12 @@ def check_size(content: bytes, where: object, limit: int = MAX_DOCUMENT_BYTES) -
     return content
 
 
+def bytes_in(path: Path) -> int:
+    """Return the bytes of a file, or of all files in a folder."""
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    return sum(file.stat().st_size for file in files)
+
+
 @contextlib.contextmanager
 def fitting_memory(where: object) -> Iterator[None]:
     """Make room for a selection of an array inside.
