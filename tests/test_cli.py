@@ -10,13 +10,8 @@ from pathlib import Path
 import pytest
 
 import weighttraj as wt
-
-
-def run(
-    program: str, *arguments: object, answers: str | None = None
-) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", f"{program}.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, input=answers)
+from tests.shell import process
+from tests.shell import shell as run
 
 
 @pytest.mark.parametrize(
@@ -48,8 +43,9 @@ def test_verify_fails_on_damage(tmp_path: Path) -> None:
     with wt.RunWriter(tmp_path / "r.zarr", wt.RunInfo(run_id="r", layout=layout)) as writer:
         writer.append(layout.flatten({"w": [1, 2, 3]}), num_timesteps=0)
     (tmp_path / "r.zarr/policy/weights/c/0/0").unlink()
-    done = run("weighttraj", "verify", tmp_path / "r.zarr")
+    done = process("weighttraj", "verify", tmp_path / "r.zarr")
     assert done.returncode == 1
+    assert "Traceback" not in done.stderr
     assert "policy/weights/c/0/0: missing" in done.stdout
     assert "expected: the object policy/weights/c/0/0" in done.stdout
 
@@ -128,7 +124,7 @@ def test_errors_are_one_message(
 
 
 def test_a_misspelt_option_is_answered_with_the_right_one() -> None:
-    done = run("tipl", "train", "tipl", "--data", "a", "--out", "b", "--n-batchs", "3")
+    done = process("tipl", "train", "tipl", "--data", "a", "--out", "b", "--n-batchs", "3")
     assert done.returncode == 2
     assert "--n-batches" in done.stdout + done.stderr
 

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 import weighttraj as wt
+from tests.shell import shell
 from tests.small import CONFIGS, learn
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.errors import FormatError, StoreExistsError
@@ -242,8 +243,7 @@ report({str(path)!r}, {str(tmp_path / "report.html")!r})
 
 def test_the_command(tmp_path: Path) -> None:
     path, out = plain_run(tmp_path / "r.zarr", 5), tmp_path / "page.html"
-    command = [sys.executable, "-m", "weighttraj.cli", "report", str(path)]
-    command += ["--out", str(out), "--no-film"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = shell("weighttraj", "report", path, "--out", out, "--no-film")
+    assert done.returncode == 0, done.stderr
     assert done.stdout.strip().endswith(str(out))
     assert "It was left out." in Page(out.read_text()).text

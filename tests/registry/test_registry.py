@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import weighttraj as wt
+from tests.shell import shell
 from tests.small import SMALL_RECIPE
-from tests.test_cli import run as shell
 from weighttraj.collect import collect, replay
 from weighttraj.collect.settings import Seeds
 from weighttraj.errors import (

@@ -15,7 +15,7 @@ import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote import servers
 from tests.remote.conftest import Bucket, files_of, objects_of
-from tests.test_cli import run as shell
+from tests.shell import shell
 from weighttraj.errors import RegistryError
 from weighttraj.locate import locate
 from weighttraj.registry.download import source_of

@@ -18,7 +18,7 @@ import weighttraj as wt
 from tests.remote import hub as stand_in
 from tests.remote import servers
 from tests.remote.conftest import Bucket, make_bucket
-from tests.test_cli import run as shell
+from tests.shell import shell
 from weighttraj.errors import DamageError, RemoteError
 from weighttraj.remote import RemotePath
 from weighttraj.remote.store import RemoteStore

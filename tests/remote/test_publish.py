@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import random
 import shutil
 import signal
@@ -20,7 +19,7 @@ import tipl
 import weighttraj as wt
 from tests.remote import servers
 from tests.remote.conftest import Bucket, files_of, objects_of
-from tests.test_cli import run as shell
+from tests.shell import shell
 from weighttraj.errors import (
     DamageError,
     FormatError,
@@ -535,12 +534,10 @@ def test_another_data_set_of_that_name_is_not_taken_for_it(
 
 
 def test_the_command(published: Path, tmp_path: Path) -> None:
-    environment = os.environ | {"WEIGHTTRAJ_DATASETS_PATH": str(tmp_path / "store")}
     address = f"file://{tmp_path}/there/small-v1"
 
     def told(*arguments: str) -> str:
-        command = [str(Path(sys.executable).with_name("weighttraj")), *arguments]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        done = shell("weighttraj", *arguments)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
