@@ -29,8 +29,8 @@ demo: setup ## open the released data, collect a run beside it, train TIPL, judg
 test: setup ## run the tests
 	$(PYTEST)
 
-test-long: setup ## run the tests and their long versions, with the types of every call checked
-	WEIGHTTRAJ_CHECK_ALL_TYPES=1 $(PYTEST) -m "long or not long" --timeout 900
+test-long: setup ## run the tests and their long versions, on a disk, with the types of every call checked
+	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} WEIGHTTRAJ_CHECK_ALL_TYPES=1 $(PYTEST) -m "long or not long"
 
 lint: setup ## check style and types
 	$(BIN)/ruff format --check .

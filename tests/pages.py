@@ -14,6 +14,7 @@ import pytest
 
 import tipl.cli
 import weighttraj.cli
+from tests.typecheck import unchecked
 
 ROOT = Path(__file__).parents[1]
 PROGRAMS: dict[str, Callable[[], None]] = {
@@ -21,8 +22,6 @@ PROGRAMS: dict[str, Callable[[], None]] = {
     "tipl": tipl.cli.main,
 }
 
-LONG = ("tipl evaluate", "tipl check", "tipl train baselines")
-"""Commands for which the checks of shapes, here, take longer than the start of a process."""
 QUICKER = (
     "--quick --starts 50 --function-starts 10 --learning-starts 1 --plateau-starts 0"
     " --bootstrap 100"
@@ -40,6 +39,8 @@ def run_page(
 ) -> dict[str, Any]:
     """Run all blocks of a page in the current folder; returns the names that its Python made.
 
+    The types of calls are not checked: that takes half of the time, and other tests check them.
+
     Args:
         page: Markdown.
         shorter: what is replaced by what; each of these must be there.
@@ -52,7 +53,8 @@ def run_page(
             used |= {long} if long in text else set()
             text = text.replace(long, short)
         if language == "python":
-            exec(compile(text, page.name, "exec"), names)  # noqa: S102
+            with unchecked():
+                exec(compile(text, page.name, "exec"), names)  # noqa: S102
             continue
         for line in [text] if "<<" in text else text.splitlines():
             command = line if "<<" in text else line.partition("#")[0].strip()
@@ -65,10 +67,10 @@ def run_page(
 
 
 def run_command(command: str) -> None:
-    """Run a command: ours in this process, where a tenth of the time goes into imports."""
+    """Run a command: ours in this process, as a new one spends seconds on imports."""
     program, *arguments = shlex.split(command, comments=True)
-    if program in PROGRAMS and ">" not in arguments and not command.startswith(LONG):
-        with pytest.MonkeyPatch.context() as patch:
+    if program in PROGRAMS and ">" not in arguments:
+        with pytest.MonkeyPatch.context() as patch, unchecked():
             patch.setattr(sys, "argv", [program, *arguments])
             try:
                 PROGRAMS[program]()

@@ -14,11 +14,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from weighttraj.collect import PPOConfig, Recipe, make_ppo
 from weighttraj.collect.settings import Seeds, Store
 
-# 4 rollouts of 256 steps, 8 gradient steps each: a second of training, same code as a long one.
-SMALL = PPOConfig(total_timesteps=1024, n_steps=256, n_epochs=2, critic_arch=(8, 8))
+# 4 rollouts of 64 steps, 8 gradient steps each: a second of training, same code as a long one.
+SMALL = PPOConfig(total_timesteps=256, n_steps=64, batch_size=16, n_epochs=2, critic_arch=(8, 8))
 SMALL_RECIPE = Recipe(
     id="small",
-    ppo=replace(SMALL, total_timesteps=768, n_steps=64, batch_size=16),
+    ppo=replace(SMALL, total_timesteps=768),
     seeds=Seeds(train=[0, 1], test=[2, 3]),
     store=Store(every=2, block=8, probe_observations=4),
 )

@@ -57,19 +57,17 @@ def test_read(reader: Path) -> None:
     run_page(DOCS / "index.md")
     names = run_page(DOCS / "read.md")
     assert names["weights"].shape == (122, 1951)
-    assert names["batch"]["weights"].shape == (32, 122)
+    assert names["batch"]["weights"].shape == (28, 122)  # the last one of an epoch
     assert torch.isfinite(names["error"]).all()
     assert len(wt.open("data/demo/divided.h5")) == 5
 
 
-@pytest.mark.timeout(300)
 def test_collect(reader: Path) -> None:
     run_page(DOCS / "collect.md", {"--episodes 5": "--episodes 1"})
     assert len(wt.open("data/both")) == 7
     assert wt.verify("data/both") == []
 
 
-@pytest.mark.timeout(300)
 def test_train(reader: Path) -> None:
     shorter = {
         "--n-batches 500": "--n-batches 4",
@@ -116,7 +114,6 @@ def background(command: str) -> Iterator[subprocess.Popen[str]]:
             process.terminate()
 
 
-@pytest.mark.timeout(300)
 def test_evaluate(reader: Path) -> None:
     names = run_page(DOCS / "evaluate.md", {"--quick": QUICKER, "--episodes 5": "--episodes 1"})
     assert names["after"] > names["before"] + 100

@@ -14,12 +14,15 @@ def samples(small_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return prepare(small_dataset, tmp_path_factory.mktemp("doors") / "samples")
 
 
-@pytest.mark.parametrize("first", [0, 1000, 2000])
-def test_every_door_ends_in_an_answer_or_a_clear_error(samples: Path, first: int) -> None:
-    result = fuzz(samples, seed=7, first=first, n=100)
+@pytest.mark.parametrize(
+    ("first", "n"),
+    [(0, 80), *(pytest.param(first, 100, marks=pytest.mark.long) for first in (80, 1000, 2000))],
+)
+def test_every_door_ends_in_an_answer_or_a_clear_error(samples: Path, first: int, n: int) -> None:
+    result = fuzz(samples, seed=7, first=first, n=n)
     assert result.broken == []
-    assert result.counts["refused"] > 20
-    assert result.counts["answered"] > 20
+    assert result.counts["refused"] > n / 5
+    assert result.counts["answered"] > n / 5
 
 
 def test_every_unchanged_sample_passes_every_door(samples: Path, tmp_path: Path) -> None:

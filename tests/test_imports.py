@@ -26,39 +26,36 @@ def run(code: str) -> str:
 HEAVY_FOR_COMMANDS = ["torch", "zarr", "stable_baselines3", "mujoco", "matplotlib", "gymnasium"]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "tipl --help",
-        "tipl --version",
-        "tipl zoo",
-        "tipl train --help",
-    ],
-)
-def test_a_list_of_models_or_commands_loads_nothing_heavy(command: str) -> None:
-    said = run(
-        f"import sys; sys.argv = {command.split()}\n"
-        f"from {command.split()[0]}.cli import main\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        f"print([m for m in {HEAVY_FOR_COMMANDS} if m in sys.modules])"
-    )
-    assert said.endswith("[]"), said
+LOADED = """
+import sys
+from {program}.cli import main
+for command in {commands}:
+    sys.argv = [{program!r}, *command.split()]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, command
+    print(f"after {{command}}:", [m for m in {heavy} if m in sys.modules])
+"""
 
 
-@pytest.mark.parametrize(
-    "command", ["--help", "--version", "list --help", "list", "show inverted-pendulum-v4-ppo-v1"]
-)
-def test_a_look_at_data_sets_loads_no_torch(command: str) -> None:
+def loaded(program: str, commands: list[str], heavy: list[str]) -> list[str]:
+    """What a process that gives these commands has loaded after each."""
+    said = run(LOADED.format(program=program, commands=commands, heavy=heavy))
+    return [line for line in said.splitlines() if line.startswith("after ")]
+
+
+def test_a_list_of_models_or_commands_loads_nothing_heavy() -> None:
+    commands = ["--help", "--version", "zoo", "train --help"]
+    expected = [f"after {command}: []" for command in commands]
+    assert loaded("tipl", commands, HEAVY_FOR_COMMANDS) == expected
+
+
+def test_a_look_at_data_sets_loads_no_torch() -> None:
     heavy = ["torch", "stable_baselines3", "mujoco", "matplotlib", "gymnasium"]
-    said = run(
-        f"import sys; sys.argv = ['weighttraj', *{command.split()}]\n"
-        "from weighttraj.cli import main\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        f"print([m for m in {heavy} if m in sys.modules])"
-    )
-    assert said.endswith("[]"), said
+    commands = ["--help", "--version", "list --help", "list", "show inverted-pendulum-v4-ppo-v1"]
+    expected = [f"after {command}: []" for command in commands]
+    assert loaded("weighttraj", commands, heavy) == expected
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:

@@ -19,7 +19,6 @@ README = (ROOT / "README.md").read_text()
 PAGES = [ROOT / "README.md", *sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("cards/**/*.md")])]
 
 
-@pytest.mark.timeout(300)  # each demo in it is a short one
 def test_every_block_runs(reader: Path) -> None:
     shorter = {
         "--n-batches 500": "--n-batches 4",

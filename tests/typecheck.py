@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from beartype import BeartypeConf, beartype
+from jaxtyping import config
 
 typecheck = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """An int is a float, as for static type checkers."""
@@ -26,3 +29,14 @@ def checked_modules() -> list[str]:
         for file in sorted(files)
         if "from jaxtyping" in file.read_text()
     ]
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """Check no types meanwhile: for long runs of functions that other tests call with checks."""
+    before = config.jaxtyping_disable
+    config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        config.update("jaxtyping_disable", before)

@@ -22,6 +22,7 @@ from rich.console import Console
 import weighttraj as wt
 from tests.collect.test_runner import assert_same_arrays, committed
 from tests.disk import grow
+from tests.shell import shell
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe, replay
 from weighttraj.collect.settings import Collect, Seeds
@@ -90,7 +91,8 @@ def test_a_killed_population_goes_on_in_any_grouping(quick: Path, tmp_path: Path
     assert process.returncode == -signal.SIGKILL
     assert all(8 <= committed(path) < 49 for path in paths)
     recipe.write_text(TOML.replace("[store]", "population = 1\n[store]"))
-    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    again = shell("weighttraj", "collect", recipe, "--out", out)
+    assert again.returncode == 0, again.stderr
     assert "continuing after the last" in " ".join(again.stdout.split())
     dataset = wt.open(out)
     assert wt.verify(out) == []

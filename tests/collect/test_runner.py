@@ -21,6 +21,7 @@ from filelock import FileLock
 from rich.console import Console
 
 import weighttraj as wt
+from tests.shell import shell
 from tests.small import SMALL, SMALL_RECIPE
 from weighttraj.collect import Recipe, collect, read_recipe
 from weighttraj.collect.costs import read_costs
@@ -352,7 +353,8 @@ def test_a_killed_collector_goes_on_where_it_was(
     assert wt.verify(path) == []
     assert np.array_equal(run.weights[:], whole.weights[: len(run)])
 
-    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    again = shell("weighttraj", "collect", recipe_file, "--out", out, "--seeds", 0)
+    assert again.returncode == 0, again.stderr
     said = " ".join(again.stdout.split())
     assert f"interrupted after {len(run)} committed snapshots" in said
     assert "continuing after the last" in said

@@ -74,10 +74,18 @@ def test_nothing_is_decoded_before_it_is_asked_for(small_dataset: Path, cache: P
     assert len(list(cache.glob("*.npy"))) == 1
 
 
-@pytest.mark.timeout(150)
-@pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
-@pytest.mark.parametrize("made", ["before", "by the workers"])
-def test_worker_processes_read_the_same(small_dataset: Path, context: str, made: str) -> None:
+@pytest.mark.parametrize(
+    ("made", "context"),
+    [
+        ("before", "fork"),
+        ("before", "spawn"),
+        ("by the workers", "fork"),
+        ("by the workers", "forkserver"),
+        pytest.param("before", "forkserver", marks=pytest.mark.long),
+        pytest.param("by the workers", "spawn", marks=pytest.mark.long),
+    ],
+)
+def test_worker_processes_read_the_same(small_dataset: Path, made: str, context: str) -> None:
     data = wt.open(small_dataset).split("train").to_torch(window=20, stride=7)
     if made == "before":
         data.batch(range(len(data)))

@@ -113,8 +113,8 @@ def test_training_can_go_on_from_a_snapshot(run: wt.Run, tmp_path: Path) -> None
     if exported.vecnormalize is not None:
         env = VecNormalize.load(str(exported.vecnormalize), env)  # type: ignore[assignment]
     model = PPO.load(exported.model, env=env, device="cpu")  # SB3 compares the spaces
-    model.learn(256, reset_num_timesteps=False)
-    assert model.num_timesteps == run.num_timesteps[-1] + 256
+    model.learn(64, reset_num_timesteps=False)
+    assert model.num_timesteps == run.num_timesteps[-1] + 64
 
 
 @pytest.mark.parametrize("t", [0, 7])

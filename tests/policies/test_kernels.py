@@ -24,7 +24,6 @@ FAMILIES = (
 )
 IDS = [f"{family}-{version}" for family in FAMILIES for version in ("v4", "v5")]
 SEEDS = (3, 4)
-STEPS = 1000
 
 SETTINGS: list[tuple[str, dict[str, Any]]] = [
     ("HalfCheetah-v4", {"exclude_current_positions_from_observation": False}),
@@ -39,9 +38,9 @@ SETTINGS: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.parametrize("steps", [200, pytest.param(1000, marks=pytest.mark.long)])
 @pytest.mark.parametrize(("env_id", "kwargs"), [*((i, {}) for i in IDS), *SETTINGS])
-def test_a_thousand_random_steps_are_gymnasiums(env_id: str, kwargs: dict[str, Any]) -> None:
-    steps = STEPS if not kwargs else 200
+def test_random_steps_are_gymnasiums(env_id: str, kwargs: dict[str, Any], steps: int) -> None:
     envs = [environments.make(env_id, **kwargs) for _ in range(2 * len(SEEDS))]
     simulator = make_simulator(lambda: environments.make(env_id, **kwargs), SEEDS)
     assert isinstance(simulator, PhysicsSimulator)

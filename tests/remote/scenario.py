@@ -1,6 +1,6 @@
-"""Publish a data set and a model; in another process load both by name, train, and evaluate.
+"""Load a published data set and a published model by name, train, and evaluate.
 
-Run by ``test_everywhere.py``: ``python -m tests.remote.scenario publish|use DATA MODEL ...``.
+Run by ``test_everywhere.py``: ``python -m tests.remote.scenario DATA MODEL OUT``.
 """
 
 from __future__ import annotations
@@ -13,11 +13,6 @@ import tipl
 import weighttraj as wt
 
 MODEL = "tipl-gate-inverted-pendulum-v4"
-
-
-def publish(data: str, model: str, folder: str) -> None:
-    wt.upload(folder, data)
-    tipl.push(MODEL, model)
 
 
 def use(data: str, model: str, out: str) -> None:
@@ -39,4 +34,4 @@ def use(data: str, model: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    {"publish": publish, "use": use}[sys.argv[1]](*sys.argv[2:])
+    use(*sys.argv[1:])

@@ -15,7 +15,6 @@ from tests.remote.conftest import make_bucket
 from weighttraj.registry import create, write_card
 
 
-@pytest.mark.timeout(300)
 def test_publish_and_load(
     reader: Path,
     few_released: Path,

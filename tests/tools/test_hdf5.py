@@ -35,14 +35,22 @@ from weighttraj.writer import RunWriter
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> wt.Run:
-    return write(tmp_path / "run.zarr")
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run and the file of it. Do not write to them."""
+    path = tmp_path_factory.mktemp("made")
+    export_hdf5(write(path / "run.zarr"), path / "run.h5")
+    return path
 
 
 @pytest.fixture
-def file(run: wt.Run, tmp_path: Path) -> Path:
-    return export_hdf5(run, tmp_path / "run.h5")
+def run(made: Path, tmp_path: Path) -> wt.Run:
+    return wt.open_run(shutil.copytree(made / "run.zarr", tmp_path / "run.zarr"))
+
+
+@pytest.fixture
+def file(made: Path, run: wt.Run, tmp_path: Path) -> Path:
+    return Path(shutil.copy(made / "run.h5", tmp_path / "run.h5"))
 
 
 def bits(run: wt.Run) -> dict[str, tuple[tuple[int, ...], bytes]]:
@@ -258,9 +266,10 @@ def weights_of(run: wt.Run) -> bytes:
     return run.weights[:].tobytes()
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
-@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+@pytest.mark.parametrize(
+    "method", ["fork", "spawn", pytest.param("forkserver", marks=pytest.mark.long)]
+)
 def test_other_processes_read_it(file: Path, method: str) -> None:
     run = open_hdf5(file).runs[0]
     expected = weights_of(run)
