@@ -146,16 +146,12 @@ class Learners:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Epoch:
-    """A rollout in the order of one epoch: the first axes are (minibatch, learner, sample)."""
+class _Epoch(Rollout):
+    """A rollout in the order of one epoch: the first axes are (minibatch, learner, sample).
 
-    observations: Tensor
-    actions: Tensor
-    log_probs: Tensor
-    values: Tensor
-    advantages: Tensor
-    """Standardised in each minibatch, if the settings say so."""
-    returns: Tensor
+    Advantages are standardised in each minibatch, if the settings say so.
+    """
+
     now_log_probs: Tensor
     """Filled in as the epoch goes on: by the policy before the minibatch's gradient step."""
     now_values: Tensor
