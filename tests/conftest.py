@@ -106,6 +106,17 @@ def few_released(shared: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def brief_released(shared: Path, few_released: Path) -> Path:
+    """Their first 241 snapshots, for what trains on all of them. Do not write to it."""
+    path = shared / f"brief/{few_released.name}"
+    with FileLock(shared / "brief.lock"):
+        if not path.exists():
+            steps = (0, 100_000)
+            wt.download(few_released.as_uri(), path, steps=steps, arrays=["eval", "probe"])
+    return path
+
+
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 64 KiB; ``grow`` makes it larger."""
