@@ -206,3 +206,16 @@ def test_a_file_that_may_not_grow_leaves_nothing(tmp_path: Path) -> None:
     assert "File too large" in done.stdout
     assert str(tmp_path / "file") in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a hard link", "a device"])
+def test_nothing_is_added_to_what_is_no_file_of_the_data_alone(data: Path, kind: str) -> None:
+    if kind == "a pipe":  # which would be waited for
+        os.mkfifo(data / "file")
+    elif kind == "a hard link":
+        os.link(data.parent / "outside/file", data / "file")
+    else:
+        (data / "file").symlink_to("/dev/null")
+    with pytest.raises(FormatError), appending(data / "file", root=data) as file:
+        file.write(b"theirs")
+    assert untouched(data)

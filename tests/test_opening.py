@@ -125,3 +125,12 @@ def test_a_folder_that_holds_a_data_set_in_data_opens(small_dataset: Path, tmp_p
     shutil.copytree(small_dataset, tmp_path / "mine/data")
     assert wt.open(tmp_path / "mine").path == tmp_path / "mine/data"
     assert len(wt.open(tmp_path / "mine")) == 4
+
+
+@pytest.mark.parametrize("path", ["", ".", "/"])
+def test_a_folder_without_a_name_is_no_run(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no run at"):
+        wt.open_run(path)

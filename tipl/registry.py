@@ -152,6 +152,8 @@ def kind_in(folder: Path) -> str:
     """
     file = folder / "config.json"
     try:
+        if not file.is_file():
+            raise ValueError("config.json is no plain file")
         if (size := file.stat().st_size) > MOST_CONFIG:
             raise ValueError(f"config.json of {size:,} bytes")
         kind = str(json.loads(file.read_text(encoding="utf-8"))["kind"])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import stat
 import tempfile
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -120,6 +121,7 @@ def read_config(path: str | Path, kind: str, wanted: type[T]) -> T:
         ModelError: it is of another kind, or its settings are not those of its kind.
     """
     file = Path(path) / CONFIG
+    check_plain(file)
     if file.stat().st_size > MOST_CONFIG:
         raise broken(path, f"{CONFIG} of {file.stat().st_size:,} bytes")
     try:
@@ -140,7 +142,10 @@ def read_arrays(path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> dict
     """
     if (got := header_of(path)) != dict(shapes):
         raise broken(path, f"arrays {got}, not {dict(shapes)}")
-    return {name: tensor.numpy() for name, tensor in _tensors(path).items()}
+    try:
+        return {name: tensor.numpy() for name, tensor in _tensors(path).items()}
+    except TypeError as error:  # types that NumPy lacks
+        raise broken(path, error) from error
 
 
 def load_network(build: Callable[[], N], config: Any, path: str | Path) -> N:
@@ -179,7 +184,7 @@ def _tensors(path: str | Path) -> dict[str, Tensor]:
     """Return the arrays in a folder, all of them finite."""
     try:
         tensors = load_tensors(Path(path) / ARRAYS)
-    except SafetensorError as error:
+    except (SafetensorError, OSError, TypeError, AttributeError) as error:  # types NumPy lacks
         raise broken(path, error) from error
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
         raise broken(path, "numbers that are not finite")
@@ -189,11 +194,23 @@ def _tensors(path: str | Path) -> dict[str, Tensor]:
 def header_of(path: str | Path) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays in a folder; no array is read."""
     file = Path(path) / ARRAYS
+    check_plain(file)
     try:
         with safe_open(file, "np") as arrays:
             return {name: tuple(arrays.get_slice(name).get_shape()) for name in arrays.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise broken(path, error) from error
+
+
+def check_plain(file: Path) -> None:
+    """Check that a file of a model is a file, or a link to one, as caches of the hub have them.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ModelError: it is a folder, a pipe, which would be waited for, or a device.
+    """
+    if not stat.S_ISREG(file.stat().st_mode):
+        raise broken(file.parent, f"{file.name} that is no plain file")
 
 
 def broken(path: str | Path, why: object) -> ModelError:

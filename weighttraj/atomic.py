@@ -31,6 +31,7 @@ DRAFT = ".draft"
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_ADD = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _LINKED = (errno.ELOOP, errno.ENOTDIR, errno.EMLINK)  # what systems say of O_NOFOLLOW and a link
 
 
@@ -113,11 +114,22 @@ def appending(path: Path, *, root: Path) -> Iterator[BinaryIO]:
     """Open a file of a data set, new or old, to add to its end; it survives a power cut.
 
     Raises:
-        FormatError: a part of the path below ``root`` is a link.
+        FormatError: a part of the path below ``root`` is a link, or the file has another name, too,
+            or is no plain file.
     """
     with _parent_of(path, root) as folder:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-        with os.fdopen(os.open(path.name, flags, 0o666, dir_fd=folder), "ab") as file:
+        try:
+            number = os.open(path.name, _ADD, 0o666, dir_fd=folder)
+        except OSError as error:
+            if error.errno != errno.ENXIO:  # a pipe that nobody reads
+                raise
+            raise _misplaced(path, "a pipe") from error
+        with os.fdopen(number, "ab") as file:
+            status = os.fstat(number)
+            if not stat.S_ISREG(status.st_mode):
+                raise _misplaced(path, "no plain file")
+            if status.st_nlink > 1:  # what is added would be added to another's file
+                raise _misplaced(path, "a file that has another name elsewhere")
             yield file
             file.flush()
             os.fsync(file.fileno())

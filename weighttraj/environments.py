@@ -93,6 +93,24 @@ def _refuse_endless_steps(settings: Mapping[str, Any], info: EnvInfo) -> None:
         )
 
 
+def texts_of(value: Any) -> Iterator[str]:
+    """Yield every string in a keyword's value."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            yield from texts_of(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from texts_of(item)
+
+
+def stands_for_another(text: str) -> bool:
+    """Return whether earlier versions wrote such a text for an infinite number or a function."""
+    return text in ("inf", "-inf", "nan") or "<lambda>" in text or "<locals>" in text
+
+
 def made_by(function: Callable[[], Any]) -> gym.Env[Any, Any]:
     """Make an environment with a user's function.
 

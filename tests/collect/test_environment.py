@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import weighttraj as wt
 from weighttraj import environments
 from weighttraj.collect import WeightTrajectoryCallback, describe_mlp
-from weighttraj.errors import PolicyError
+from weighttraj.errors import CollectError, PolicyError
 from weighttraj.policies import evaluate
 
 Make = Callable[[], Any]
@@ -82,6 +82,9 @@ def registered() -> Iterator[None]:
         del gym.registry[f"{name}-v0"]
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:this training is recorded, but its environment")
+
+
 def record(make: Make, path: Path) -> wt.Run:
     """A short training, recorded."""
     env = make()
@@ -103,6 +106,17 @@ def changed(**attributes: Any) -> Make:
     return make
 
 
+def nested(depth: int) -> Any:
+    """Dicts in one another."""
+    return {"a": nested(depth - 1)} if depth else 5
+
+
+def within_itself() -> list[Any]:
+    value: list[Any] = [5]
+    value.append(value)
+    return value
+
+
 @pytest.mark.parametrize(
     ("value", "kind"),
     [
@@ -120,10 +134,13 @@ def changed(**attributes: Any) -> Make:
         ([0, {"a": lambda: 5}], "list"),
         (10**30, "int"),
         (Path("a"), "PosixPath"),
+        (nested(25), "dict"),
+        (within_itself(), "list"),
     ],
 )
 def test_a_keyword_that_cannot_be_written_is_named(value: Any, kind: str, tmp_path: Path) -> None:
-    run = record(lambda: gym.make("Paying-v0", other=value, bonus=2.0), tmp_path)
+    with pytest.warns(UserWarning, match=r"cannot be made again from the record\n.*`other`"):
+        run = record(lambda: gym.make("Paying-v0", other=value, bonus=2.0), tmp_path)
     assert run.info.env is not None
     assert run.info.env.kwargs == {"bonus": 2.0}
     assert run.info.env.cannot_remake == (f"keyword `other` ({kind})",)
@@ -144,7 +161,9 @@ def test_a_reward_function_is_given_again_by_a_function_that_makes_the_environme
     assert played.returns.tolist() == [50.0] * 3
 
 
-@pytest.mark.parametrize("value", [(0.7, math.inf), math.inf, [1, -math.inf], {"a": (1,)}, "inf"])
+@pytest.mark.parametrize(
+    "value", [(0.7, math.inf), math.inf, [1, -math.inf], {"a": (1,)}, "inf", nested(20)]
+)
 def test_a_keyword_comes_back_as_it_was(value: Any, tmp_path: Path) -> None:
     run = record(lambda: gym.make("Paying-v0", other=value), tmp_path)
     assert run.info.env is not None
@@ -329,3 +348,15 @@ def test_actions_behind_a_clip_are_stored_unbounded_and_played_within_bounds(
     played = evaluate(run.load_policy(), run, episodes=2)
     del gym.registry["Costly-v0"]
     assert played.returns.tolist() == [10.0, 10.0]
+
+
+def test_settings_of_a_normaliser_are_numbers(tmp_path: Path) -> None:
+    def make(**settings: Any) -> Any:
+        return VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), **settings)
+
+    run = record(lambda: make(clip_obs=np.float32(0.1), epsilon=np.float64(1e-6)), tmp_path)
+    assert run.info.obs_norm is not None
+    assert run.info.obs_norm.clip_high == float(np.float32(0.1))
+    assert run.info.obs_norm.epsilon == 1e-6
+    with pytest.raises(CollectError, match=r"(?s)for clip_obs.*ndarray"):
+        record(lambda: make(clip_obs=np.array([1.0, 2.0, 3.0])), tmp_path / "array")

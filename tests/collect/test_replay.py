@@ -46,3 +46,17 @@ def test_an_unknown_seed_is_refused(small_dataset: Path) -> None:
     with pytest.raises(CollectError, match=r"seeds \[0, 1, 2, 3\]"):
         replay(small_dataset, 5, seed=9)
     assert wt.verify(small_dataset) == []
+
+
+@pytest.mark.parametrize("threads", [-1, 2**31])
+def test_threads_that_no_machine_has_are_refused(
+    threads: int, small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+    run = wt.open(small_dataset)[0]
+    info = replace(run.info, provenance=replace(run.info.provenance, threads=threads))
+    monkeypatch.setattr(wt.Run, "info", info)
+    with pytest.raises(CollectError, match="so many threads"):
+        wt.collect.replay(small_dataset, 1)
+    assert asked == []

@@ -27,7 +27,7 @@ from weighttraj.collect import Recipe, collect, read_recipe
 from weighttraj.collect.costs import read_costs
 from weighttraj.collect.settings import Seeds, Store, parse_seeds
 from weighttraj.collect.tasks import Task, collect_block
-from weighttraj.errors import CollectError, EngineError, RecipeError
+from weighttraj.errors import CollectError, EngineError, FormatError, RecipeError
 from weighttraj.format import RunEntry
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
@@ -483,3 +483,14 @@ def test_an_unknown_environment_is_refused_before_anything_is_written(tmp_path: 
     with pytest.raises(RecipeError, match=r"env_id = 'NoSuchEnv-v0': Environment .* doesn't exist"):
         collect(recipe, tmp_path / "dataset", workers=1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_lines_of_costs_are_left_out_and_links_refused(tmp_path: Path) -> None:
+    assert read_costs(tmp_path) == []
+    file = tmp_path / ".costs.jsonl"
+    file.write_bytes(b'{"seeds": [1]}\n\xff\n' + b"[" * 100_000 + b'\n7\n{"seeds": [2]}\n')
+    assert read_costs(tmp_path) == [{"seeds": [1]}, {"seeds": [2]}]
+    file.rename(tmp_path / "other")
+    file.symlink_to(tmp_path / "other")
+    with pytest.raises(FormatError, match="link"):
+        read_costs(tmp_path)

@@ -249,10 +249,29 @@ def test_the_command(
     here = [LocalDataset("small", place / "small")]
     monkeypatch.setattr(cli.registry, "local_datasets", lambda: here)  # not the large ones
     out = place / "made"
-    cli._report(cli._Report(all=True, film=False, out=out, cards=place / "cards"))
+    cli._report(all=True, film=False, out=out, cards=place / "cards")
     assert capsys.readouterr().out.endswith("index.html\n")
     assert (out / "data/small.html").is_file()
     assert (out / "models/a-model.html").is_file()
     with pytest.raises(SystemExit):
-        cli._report(cli._Report())
+        cli._report()
     assert "--all" in capsys.readouterr().err
+
+
+def test_a_gallery_is_not_written_through_links(place: Path) -> None:
+    (place / "mine").mkdir()
+    for name in ("data", "models", "models/a-model", "models/a-model/a-model.svg"):
+        (place / "out" / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / "out" / name).symlink_to(place / "mine")
+        make(place)
+        (place / "out" / name).unlink()
+        assert list((place / "mine").iterdir()) == []
+        shutil.rmtree(place / "out")
+
+
+def test_a_picture_that_no_page_of_ours_has_put_there_stays(place: Path) -> None:
+    mine = place / "out/models/a-model/a-model.svg"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+    assert "a-model" not in make(place).read_text()
+    assert mine.read_text() == "mine"

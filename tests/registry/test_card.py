@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import mlcroissant
@@ -16,6 +17,7 @@ import weighttraj as wt
 from weighttraj.errors import RegistryError
 from weighttraj.registry import write_card
 from weighttraj.registry.card import SECTIONS, START, new_card, refreshed
+from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 RELEASED = Path(__file__).parents[2] / "datasets/inverted-pendulum-v4-ppo-v1/data"
 
@@ -104,3 +106,9 @@ def test_a_data_set_of_which_little_is_said(tmp_path: Path) -> None:
     text = write_card(tmp_path / "bare").read_text()
     assert "while training trains them on an environment not said: 1 runs of 5 snapshots" in text
     assert wt.verify(tmp_path / "bare") == []
+
+
+def test_a_data_set_without_runs_has_no_card(data: Path) -> None:
+    write_dataset_info(data, replace(read_dataset_info(data), runs=()))
+    with pytest.raises(RegistryError, match="this one has none"):
+        write_card(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,14 @@ import pytest
 
 from tipl.commands.evaluate import _table
 from tipl.errors import EvaluateError
-from tipl.evaluation.results import Measure, Results, Row, read_results
-from tipl.report.figures import OTHERS, figures, skill_figure, styles, titles
+from tipl.evaluation.results import Measure, Results, Row, read_results, write_document
+from tipl.report.figures import OTHERS, figures, file_name, skill_figure, styles, titles
 from tipl.report.markdown import insert_markdown, places, render, rewrite
+from tipl.report.page import write_report
 from tipl.report.scores import GAIN, SKILL, row_at, shown
 from tipl.report.tables import cell, tables
 from tipl.report.verdict import paragraphs, verdict
+from weighttraj.errors import FormatError
 from weighttraj.terminal import Output
 
 ROOT = Path(__file__).parents[2]
@@ -260,3 +263,26 @@ def test_an_unknown_section_is_refused(demo: dict[str, Any], tmp_path: Path) -> 
     page.write_text(page_of("poem"))
     with pytest.raises(EvaluateError, match=r"no such section of results(.|\n)*overview, verdict"):
         insert_markdown(typed(demo), DEMO, page)
+
+
+def test_a_report_is_not_written_through_a_link(demo: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "theirs").mkdir()
+    results = typed(demo)
+    for name in ("report.html", file_name(titles(results)[0]), "results.json"):
+        (tmp_path / "theirs" / name).unlink(missing_ok=True)
+        (tmp_path / "theirs" / name).symlink_to(tmp_path / "mine")
+        with pytest.raises(FormatError, match="link"):
+            write_document(tmp_path / "theirs/results.json", results)
+            write_report(results, tmp_path / "theirs")
+        (tmp_path / "theirs" / name).unlink()
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert write_report(results, tmp_path / "theirs").read_text().startswith("<!")
+
+
+def test_results_that_are_no_file_are_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "results.json")
+    with pytest.raises(EvaluateError, match="no results"):
+        read_results(tmp_path / "results.json")
+    with pytest.raises(FileNotFoundError, match="no results at"):
+        read_results(tmp_path / "others.json")

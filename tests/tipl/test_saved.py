@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file, save_file
+from safetensors.torch import save_file as save_tensors
 
 import tipl
 from tests.tipl.lively import lively_causal, lively_gate
@@ -20,6 +22,7 @@ from tipl.models.baselines.nowcaster import NowcasterConfig
 from tipl.models.scaled import ScaledGate
 from tipl.models.tipl import GPT, TIPL, GPTConfig, TIPLConfig
 from tipl.registry import load
+from tipl.saved import read_arrays
 
 GPT_SIZES = GPTConfig(rank=3, max_timestep=9, block_size=4, n_layer=1, n_embd=8)
 NOWCASTER = NowcasterConfig(horizons=(1, 5))
@@ -122,3 +125,29 @@ def test_loading_moves_no_random_number(tmp_path: Path) -> None:
     before = torch.get_rng_state()
     load(tmp_path)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
+def test_what_is_no_file_is_neither_waited_for_nor_read(
+    name: str, kind: str, tmp_path: Path
+) -> None:
+    lively_gate().save(tmp_path)
+    (tmp_path / name).unlink()
+    if kind == "pipe":
+        os.mkfifo(tmp_path / name)
+    elif kind == "folder":
+        (tmp_path / name).mkdir()
+    else:
+        (tmp_path / name).symlink_to("/dev/zero")
+    with pytest.raises(ModelError, match=f"{name} .*is no plain file"):
+        lively_gate().load(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float8_e5m2])
+def test_arrays_of_types_that_numpy_lacks_are_refused(dtype: torch.dtype, tmp_path: Path) -> None:
+    save_file({"a": np.zeros(3, np.float32)}, tmp_path / "model.safetensors")
+    assert read_arrays(tmp_path, {"a": (3,)})["a"].tolist() == [0, 0, 0]
+    save_tensors({"a": torch.zeros(3).to(dtype)}, tmp_path / "model.safetensors")
+    with pytest.raises(ModelError):
+        read_arrays(tmp_path, {"a": (3,)})

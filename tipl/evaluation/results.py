@@ -9,6 +9,9 @@ from typing import Any, Literal
 import msgspec
 
 from tipl.errors import EvaluateError
+from weighttraj.atomic import replace_file
+from weighttraj.errors import FormatError
+from weighttraj.store.objects import read_plain
 
 
 class Interval(msgspec.Struct, frozen=True, kw_only=True):
@@ -128,6 +131,9 @@ class Results(msgspec.Struct, frozen=True, kw_only=True):
     """The command that made them."""
 
 
+_MOST = 2**28
+"""Bytes that a result file may have."""
+
 Measure = Callable[[Scores], Sequence[Row]]
 """Reads one figure of a forecaster: a row for each horizon, or nothing."""
 
@@ -140,8 +146,8 @@ def read_results(file: Path) -> Results:
         FileNotFoundError: it is not there.
     """
     try:
-        return msgspec.json.decode(file.read_bytes(), type=Results)
-    except msgspec.DecodeError as error:
+        return msgspec.json.decode(_content(file), type=Results)
+    except (msgspec.DecodeError, RecursionError, FormatError) as error:
         raise EvaluateError(
             "the file holds no results",
             expected="results.json, as `tipl evaluate` writes it",
@@ -151,8 +157,20 @@ def read_results(file: Path) -> Results:
         ) from error
 
 
+def _content(file: Path) -> bytes:
+    """Return the bytes of a result file, which a stranger may have sent.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        FormatError: it is no plain file, or too large.
+    """
+    if not file.exists():
+        raise FileNotFoundError(f"no results at {file}")
+    return read_plain(file.resolve(), _MOST)  # a link of the user's own is followed
+
+
 def write_document(file: Path, document: Any) -> None:
     """Write a document as indented JSON."""
     file.parent.mkdir(parents=True, exist_ok=True)
     text = msgspec.json.format(msgspec.json.encode(document), indent=1)
-    file.write_bytes(text + b"\n")
+    replace_file(file, text + b"\n", root=file.parent)

@@ -239,6 +239,13 @@ def _legend(fig: Figure) -> None:
     )
 
 
+def png(fig: Figure, dpi: int) -> bytes:
+    """The figure as a picture."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
 def svg(fig: Figure) -> str:
     """Return the figure as text for a page; the same bytes for the same figure."""
     buffer = io.StringIO()

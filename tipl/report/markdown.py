@@ -26,9 +26,10 @@ import jinja2
 
 from tipl.errors import EvaluateError
 from tipl.evaluation.results import Results
-from tipl.report.figures import figures, file_name, titles
+from tipl.report.figures import figures, file_name, png, titles
 from tipl.report.tables import Table, cell, headline, label, tables
 from tipl.report.verdict import paragraphs
+from weighttraj.atomic import replace_file
 
 SECTIONS = ("overview", "verdict", "tables", "figures", "source")
 DPI = 110
@@ -95,10 +96,10 @@ def insert_markdown(results: Results, source: Path, page: Path) -> None:
     text = rewrite(old, "results", source.as_posix(), lambda s: render(results, source, s))
     if (source.as_posix(), "figures") in {(place.source, place.section) for place in places(text)}:
         folder = page.parent / source.stem
-        folder.mkdir(exist_ok=True)
         for title, figure in figures(results).items():
-            figure.savefig(folder / file_name(title), dpi=DPI)
-    page.write_text(text, encoding="utf-8")
+            content = png(figure, dpi=DPI)
+            replace_file(folder / file_name(title), content, root=folder.parent)
+    replace_file(page.resolve(), text.encode())
 
 
 def render(results: Results, source: Path, section: str) -> str:

@@ -13,9 +13,10 @@ from tipl.evaluation.evaluate import evaluate_only
 from tipl.evaluation.results import Results
 from tipl.evaluation.rows import Seen
 from tipl.forecaster import Forecaster
-from tipl.report.figures import figures, file_name, svg
+from tipl.report.figures import figures, file_name, png, svg
 from tipl.report.tables import cell, headline, label, tables
 from tipl.report.verdict import verdict
+from weighttraj.atomic import replace_file
 
 
 def evaluate(
@@ -57,10 +58,14 @@ def evaluate(
 
 
 def write_report(results: Results, out: Path) -> Path:
-    """Write the page and the figures beside ``results.json``; return the path of the page."""
+    """Write the page and the figures beside ``results.json``; return the path of the page.
+
+    Raises:
+        FormatError: a link is in the place of one: the folder may be a stranger's.
+    """
     drawn = figures(results)
     for title, figure in drawn.items():
-        figure.savefig(out / file_name(title), dpi=150)
+        replace_file(out / file_name(title), png(figure, dpi=150), root=out)
     loader = jinja2.PackageLoader("tipl", "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     page = environment.get_template("report.html").render(
@@ -73,5 +78,5 @@ def write_report(results: Results, out: Path) -> Path:
         cell=cell,
     )
     path = out / "report.html"
-    path.write_text(page, encoding="utf-8")
+    replace_file(path, page.encode(), root=out)
     return path

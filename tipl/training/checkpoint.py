@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from tipl.errors import TrainError
-from weighttraj.atomic import replace_file
+from weighttraj.atomic import appending, replace_file
 
 Weights = dict[str, Tensor]
 """Parameters by name."""
@@ -109,8 +109,8 @@ def restore(
 
 def append_log(out: Path, line: Mapping[str, Any]) -> None:
     """Append one line to log.jsonl."""
-    with (out / "log.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps(line) + "\n")
+    with appending(out / "log.jsonl", root=out) as file:
+        file.write(f"{json.dumps(line)}\n".encode())
 
 
 def cut_log(out: Path, n: int) -> None:

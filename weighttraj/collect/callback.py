@@ -165,6 +165,7 @@ class WeightTrajectoryCallback(BaseCallback):
         self._check_options()
         info, counters = self._describe()
         _warn_if_lost(info, self.path)
+        _warn_if_not_remade(info, self.path)
         steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
         self._recorder = Recorder(
             self.path,
@@ -339,6 +340,18 @@ def _warn_if_lost(info: RunInfo, path: Path) -> None:
             got="; ".join(info.policy.cannot_rebuild),
             where=path,
             do="load snapshots into a model of your own with run.load_into(model, t)",
+        )
+        warnings.warn(text.message, UserWarning, stacklevel=2)
+
+
+def _warn_if_not_remade(info: RunInfo, path: Path) -> None:
+    """Tell the trainer, before the training begins, that the environment cannot be made again."""
+    if info.env is not None and info.env.cannot_remake:
+        text = PolicyError(
+            "this training is recorded, but its environment cannot be made again from the record",
+            got="; ".join(info.env.cannot_remake),
+            where=f"{path}, {info.env.id}",
+            do="keep the code that makes it, for weighttraj.policies.evaluate(policy, my_function)",
         )
         warnings.warn(text.message, UserWarning, stacklevel=2)
 

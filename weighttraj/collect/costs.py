@@ -11,9 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from weighttraj.atomic import appending
+from weighttraj.store.objects import read_plain
 
 COSTS = ".costs.jsonl"
 """Hidden file in a data set's folder, so it is no object of the data set and is not published."""
+
+
+_MOST = 2**24
+"""Bytes that the file may have."""
 
 
 @contextlib.contextmanager
@@ -44,13 +49,22 @@ def measured(folder: Path, finished: Callable[[], Sequence[int]]) -> Iterator[No
 
 
 def read_costs(folder: Path) -> list[dict[str, Any]]:
-    """Return what was written down of the collections into a folder, the first one first."""
+    """Return what was written down of the collections into a folder, the first one first.
+
+    Lines that are damaged are left out.
+
+    Raises:
+        FormatError: the file is a link, no plain file, or too large.
+    """
     file = folder / COSTS
-    return (
-        [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-        if file.is_file()
-        else []
-    )
+    if not os.path.lexists(file):
+        return []
+    found = []
+    for line in read_plain(file, _MOST).splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
+            value = json.loads(line)
+            found += [value] if isinstance(value, dict) else []
+    return found
 
 
 def _cpu_seconds() -> float:

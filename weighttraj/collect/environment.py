@@ -28,6 +28,9 @@ _RENDERING = (
     "width",
 )
 """Keywords of MuJoCo environments that change nothing but pictures."""
+_MOST_NESTED = 20
+"""Lists and dicts in one another that a keyword may have: readers of metadata refuse 64 levels, and
+a tuple takes two."""
 _OF_THE_POLICY = ("VecTransposeImage", "VecNormalize of a Dict")
 """Wrappers that prepare observations for the policy; the environment's own are not changed."""
 
@@ -102,14 +105,29 @@ def _keywords(spec: EnvSpec, env: gym.Env[Any, Any] | None) -> tuple[dict[str, A
     for name, value in spec.kwargs.items():
         if name == "render_mode":  # it would open a window
             continue
-        try:
-            encode_exactly({name: value}, "")
+        if _is_exact(name, value):
             exact[name] = value
-        except FormatError:
-            # What the registration brings, it brings again.
-            if name not in harmless and not _is_same(value, defaults.get(name)):
-                reasons.append(f"keyword `{name}` ({type(value).__name__})")
+        # What the registration brings, it brings again.
+        elif name not in harmless and not _is_same(value, defaults.get(name)):
+            reasons.append(f"keyword `{name}` ({type(value).__name__})")
     return exact, reasons
+
+
+def _is_exact(name: str, value: Any) -> bool:
+    """Return whether metadata can hold a keyword, and whether it reads back as the same one."""
+    try:
+        encode_exactly({name: value}, "")
+        return _depth(value) <= _MOST_NESTED
+    except (FormatError, RecursionError):
+        return False
+
+
+def _depth(value: Any) -> int:
+    """Return how many lists and dicts lie in one another."""
+    parts = value.values() if isinstance(value, dict) else value
+    if not isinstance(value, dict | list | tuple):
+        return 0
+    return 1 + max(map(_depth, parts), default=0)
 
 
 def _is_same(value: Any, other: Any) -> bool:

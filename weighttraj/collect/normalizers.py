@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -184,13 +185,14 @@ def _has_array_stats(wrapper: VecNormalize) -> bool:
 
 
 def _vec_obs(wrapper: VecNormalize) -> tuple[ObsNorm, Callable[[], Any]]:
-    clips = np.isfinite(wrapper.clip_obs)  # an infinite bound clips nothing
+    clip = _number(wrapper.clip_obs, "clip_obs", wrapper)
+    clips = np.isfinite(clip)  # an infinite bound clips nothing
     spec = ObsNorm(
         source="stable_baselines3.VecNormalize",
-        epsilon=wrapper.epsilon,
+        epsilon=_number(wrapper.epsilon, "epsilon", wrapper),
         shape=tuple(wrapper.observation_space.shape or ()),
-        clip_low=-wrapper.clip_obs if clips else None,
-        clip_high=wrapper.clip_obs if clips else None,
+        clip_low=-clip if clips else None,
+        clip_high=clip if clips else None,
         cast_before_clip=False,
     )
     return spec, lambda: wrapper.obs_rms
@@ -205,7 +207,7 @@ def _gymnasium_obs(
     high = min((b[1] for b in bounds), default=np.inf)
     spec = ObsNorm(
         source="gymnasium.NormalizeObservation",
-        epsilon=wrapper.epsilon,
+        epsilon=_number(wrapper.epsilon, "epsilon", wrapper),
         shape=tuple(wrapper.obs_rms.mean.shape),
         clip_low=low if np.isfinite(low) else None,
         clip_high=high if np.isfinite(high) else None,
@@ -214,13 +216,34 @@ def _gymnasium_obs(
     return spec, lambda: wrapper.obs_rms
 
 
+def _number(value: Any, name: str, wrapper: Any) -> float:
+    """Return a setting of a normaliser, which may be a number of NumPy's, as a number of Python's.
+
+    Raises:
+        CollectError: it is no real number.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if math.isnan(number):
+        raise CollectError(
+            "a setting of the observation normaliser is no number",
+            expected=f"a real number for {name}",
+            got=f"{type(value).__name__} {str(value)[:80]}",
+            where=type(wrapper).__name__,
+            do="normalise with one number for all observations",
+        )
+    return number
+
+
 def _clip_bounds(wrapper: Any) -> tuple[float, float] | None:
     """Bounds of a wrapper that clips observations; None: it does something else.
 
     CleanRL clips by a lambda. It cannot be read, but it can be asked.
     """
     if type(wrapper) is ClipObservation:
-        return wrapper.low, wrapper.high
+        return _number(wrapper.low, "low", wrapper), _number(wrapper.high, "high", wrapper)
     func = getattr(wrapper, "func", None)
     # Asked only if asking cannot change it: a function without a state of its own.
     if not isinstance(func, FunctionType) or func.__closure__ is not None:

@@ -25,6 +25,8 @@ from weighttraj.opening import open_dataset, open_run
 from weighttraj.run import Run
 from weighttraj.writer import explain_difference
 
+_MOST_THREADS = 1024
+
 
 def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
     """Train the first n snapshots of a run again and compare them with the stored ones.
@@ -103,7 +105,21 @@ def _compare(run: Run, recipe: Recipe, n: int) -> list[str]:
 
 
 def _threads(run: Run) -> int:
-    return run.info.provenance.threads or 1
+    """Return the number of torch's threads in the training.
+
+    Raises:
+        CollectError: no machine has so many; the run's metadata may be a stranger's.
+    """
+    threads = run.info.provenance.threads or 1
+    if not 1 <= threads <= _MOST_THREADS:
+        raise CollectError(
+            "the training cannot have had so many threads",
+            expected=f"from 1 to {_MOST_THREADS}",
+            got=threads,
+            where=f"{run.path}, provenance.threads",
+            do="do not use data from a source that you do not trust",
+        )
+    return threads
 
 
 def _train(run: Run, recipe: Recipe, n: int, path: Path) -> Run:

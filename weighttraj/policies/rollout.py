@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property
 from threading import Event
 from typing import Any, NamedTuple
@@ -233,7 +233,9 @@ def env_of(run: Run) -> EnvInfo:
             do="pass weighttraj.format.EnvInfo(id=...), or a function that makes the environment, "
             "instead of the run",
         )
-    texts = {name: list(_texts(value)) for name, value in run.info.env.kwargs.items()}
+    texts = {
+        name: list(environments.texts_of(value)) for name, value in run.info.env.kwargs.items()
+    }
     if paths := [text for found in texts.values() for text in found if set(text) & set("/\\")]:
         raise PolicyError(
             "the run's environment is made from files of the machine it was trained on",
@@ -241,7 +243,9 @@ def env_of(run: Run) -> EnvInfo:
             where=run.path,
             do="if you trust the data, pass run.info.env instead of the run",
         )
-    if lost := [name for name, found in texts.items() if any(map(_stands_for_another, found))]:
+    if lost := [
+        name for name, found in texts.items() if any(map(environments.stands_for_another, found))
+    ]:
         raise PolicyError(
             f"this environment cannot be made again: keyword `{lost[0]}`",
             expected="a number or a function, of which an earlier version stored the text only",
@@ -250,24 +254,6 @@ def env_of(run: Run) -> EnvInfo:
             do=environments.OWN_ENVIRONMENT,
         )
     return run.info.env
-
-
-def _texts(value: Any) -> Iterator[str]:
-    """Yield every string in a keyword's value."""
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield key
-            yield from _texts(item)
-    elif isinstance(value, list | tuple):
-        for item in value:
-            yield from _texts(item)
-
-
-def _stands_for_another(text: str) -> bool:
-    """Whether a text is what earlier versions wrote for an infinite number or a function."""
-    return text in ("inf", "-inf", "nan") or "<lambda>" in text or "<locals>" in text
 
 
 def _check_spaces(spec: PolicySpec, env: gym.Env[Any, Any]) -> None:

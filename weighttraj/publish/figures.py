@@ -18,6 +18,7 @@ from weighttraj.publish.svg import (
     blank,
     inline,
     logarithmic,
+    logarithmic_x,
     short,
     style,
     thousands,
@@ -131,7 +132,7 @@ def spectra(walks: Sequence[Walk]) -> Picture:
     for walk in walks:
         _thin_line(axes, walk.singular / (walk.singular[0] or 1), len(walks))
     logarithmic(axes)
-    axes.set_xscale("log")
+    logarithmic_x(axes)
     thousands(axes)
     style(axes, "component i", "singular value σᵢ / σ₁")
     ratio = float(np.median([w.singular[1] / w.singular[0] for w in walks]))
@@ -149,7 +150,7 @@ def tails(walks: Sequence[Walk]) -> Picture:
         left = np.where(walk.beyond > SHARE_FLOOR, walk.beyond, np.nan)
         _thin_line(axes, left, len(walks))
     logarithmic(axes)
-    axes.set_xscale("log")
+    logarithmic_x(axes)
     thousands(axes)
     style(axes, "rank d", "share of ‖Φ‖² beyond d")
     one = float(np.median([w.beyond[0] for w in walks]))

@@ -20,7 +20,7 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from rich.console import Console
 
-from weighttraj.atomic import replace_file
+from weighttraj.atomic import refuse_existing, refuse_link, replace_file
 from weighttraj.errors import FormatError, WeightTrajError
 from weighttraj.publish import figures
 from weighttraj.publish.curves import KINDS, curves
@@ -88,6 +88,7 @@ def gallery(
     """
     out, console = Path(out), console or Console(quiet=True)
     refuse_foreign(out / INDEX, overwrite=False)
+    out.mkdir(parents=True, exist_ok=True)
     found, models = [], []
     for name, path in datasets.items():
         console.print(name, markup=False)
@@ -98,7 +99,7 @@ def gallery(
             models.append(_model(card, out))
     page = template("gallery.html.j2")
     text = page.render(mark=MARK, datasets=found, models=models, script=SCRIPT, hash=_hash(SCRIPT))
-    replace_file(out / INDEX, text.encode())
+    replace_file(out / INDEX, text.encode(), root=out)
     return out / INDEX
 
 
@@ -124,6 +125,7 @@ def _dataset(name: str, path: Path, out: Path, film: bool, console: Console) -> 
     card = path / CARD
     text = _card_text(card) if card.is_symlink() or card.exists() else None
     page = f"data/{place}.html"
+    refuse_link(out / page, out)
     report(path, out / page, film=film, console=console)
     links = [("returns, steps, path", quote(page))]
     if text is not None:
@@ -176,15 +178,16 @@ def _write_card(text: str, card: Path, out: Path, page: str) -> str:
     """
     html, pictures = as_html(text, lambda src: _shown_as(card, src, page))
     target = out / f"{page}.html"
-    target.parent.mkdir(parents=True, exist_ok=True)
     refuse_foreign(target, overwrite=False)
-    for name in pictures:
-        file = out / page / name
-        file.parent.mkdir(exist_ok=True)
-        replace_file(file, read_plain(card.with_name(name), MAX_PICTURE))
+    files = {out / page / name: card.with_name(name) for name in pictures}
+    if not target.exists():  # no page of ours has put these there
+        for file in files:
+            refuse_existing(file)
     rendered = template("card.html.j2")
     body = rendered.render(mark=MARK, name=page.partition("/")[2], body=html)
-    replace_file(target, body.encode())
+    replace_file(target, body.encode(), root=out)
+    for file, picture in files.items():
+        replace_file(file, read_plain(picture, MAX_PICTURE), root=out)
     return quote(f"{page}.html")
 
 

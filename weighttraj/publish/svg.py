@@ -31,6 +31,8 @@ _SETTINGS: Any = {
     "axes.unicode_minus": True,
 }
 _SIZE = (5.2, 3.3)
+_NOTHING = (1e-3, 1.0)
+"""Limits of a logarithmic axis on which there is nothing."""
 _DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -70,9 +72,26 @@ def style(axes: Axes, x: str, y: str) -> None:
             text.set_color(INK)
 
 
+def _is_seen(axes: Axes) -> bool:
+    """Return whether a line has a point above 0."""
+    return any((np.asarray(line.get_ydata(), np.float64) > 0).any() for line in axes.lines)
+
+
+def logarithmic_x(axes: Axes) -> None:
+    """A logarithmic x axis; it is empty where nothing that is drawn is above 0."""
+    axes.set_xscale("log")
+    if not _is_seen(axes):
+        axes.set_xlim(*_NOTHING)
+
+
 def logarithmic(axes: Axes) -> None:
-    """A logarithmic y axis, labelled in plain text; call it when everything is drawn."""
+    """A logarithmic y axis, labelled in plain text; call it when everything is drawn.
+
+    The axis is empty where nothing that is drawn is above 0.
+    """
     axes.set_yscale("log")
+    if not _is_seen(axes):
+        axes.set_ylim(*_NOTHING)
     low, high = axes.get_ylim()
     decades = np.log10(high / low)
     subs = (1.0,) if decades > 2.5 else (1.0, 2.0, 5.0) if decades > 0.7 else tuple(range(1, 10))

@@ -63,6 +63,14 @@ def write_card(path: str | Path) -> Path:
             where=folder,
             do="finish collecting it",
         )
+    if not dataset.runs:
+        raise RegistryError(
+            "a card describes the runs of a data set, and this one has none",
+            expected="at least one run",
+            got="none",
+            where=folder,
+            do="collect runs, or make the data set of runs that you have: weighttraj create",
+        )
     card = folder / CARD
     check_file_names(folder)  # before anything changes
     text = _card_there(card) or new_card(dataset)

@@ -151,7 +151,7 @@ def objects_at(path: Place) -> Objects:
         from weighttraj.store.remote import remote_objects
 
         return remote_objects(path)
-    packed = path.with_name(path.name + PACKED)
+    packed = path.with_name(path.name + PACKED) if path.name else path
     if path.is_file() or (packed.is_file() and not path.exists()):
         return ZipObjects(path if path.is_file() else packed)
     if not (path / "zarr.json").is_file():
