@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -195,7 +194,7 @@ def test_a_cache_on_a_linked_disk_works(
 
 def test_a_journal_of_a_stranger_says_nothing_about_other_snapshots(complete: Path) -> None:
     """A line with a right checksum, of a snapshot or of episodes that the run does not have."""
-    from weighttraj.policies.returns import _crc, _Work
+    from weighttraj.policies.returns import _line, _Work
 
     work = _Work(wt.open(complete).runs[0], complete, FEW, replace=False)
     work._journal.begin()
@@ -212,8 +211,6 @@ def test_a_journal_of_a_stranger_says_nothing_about_other_snapshots(complete: Pa
         {"lengths": [[]]},
         {"lengths": None},
     ):
-        file.write_bytes(
-            head + _crc(json.dumps(good)).encode() + _crc(json.dumps(good | bad)).encode()
-        )
+        file.write_bytes(head + _line(good) + _line(good | bad))
         again = _Work(work.run, complete, FEW, replace=False)
         assert list(again._journal.rows) == [0]

@@ -535,6 +535,7 @@ def pendulum(wrap: Callable[[Any], Any] = lambda env: env, vec: Any = None) -> A
     return vec(env) if vec else env
 
 
+@pytest.mark.filterwarnings("ignore:this training is recorded:UserWarning")
 @pytest.mark.parametrize(
     ("make", "name"),
     [

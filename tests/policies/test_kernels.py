@@ -70,18 +70,6 @@ def test_random_steps_are_gymnasiums(env_id: str, kwargs: dict[str, Any], steps:
         assert ended > 0  # else the comparison says nothing of terminal states
 
 
-def test_threads_change_nothing() -> None:
-    actions = np.random.default_rng(1).uniform(-1, 1, (50, 8, 6)).astype(np.float32)
-    outcomes = []
-    for threads in (1, 3):
-        simulator = make_simulator(
-            lambda: environments.make("HalfCheetah-v4"), range(8), threads=threads
-        )
-        simulator.reset(1)
-        outcomes.append([simulator.step(np.arange(8), a).observations for a in actions])
-    assert np.array_equal(*outcomes)
-
-
 def test_some_simulations_can_stand_still() -> None:
     actions = np.random.default_rng(1).uniform(-1, 1, (40, 4, 3)).astype(np.float32)
     some, alone = (
