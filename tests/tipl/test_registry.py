@@ -209,7 +209,7 @@ def test_a_run_with_nan_is_named_and_the_others_are_evaluated(
     with pytest.raises(SystemExit) as end:
         call(monkeypatch, "evaluate", "last-step", *options)
     assert end.value.code == 1
-    assert "not evaluated: run r1: NaN or infinity in snapshot 30" in capsys.readouterr().err
+    assert "not evaluated: toy: run r1: NaN or infinity in snapshot 30" in capsys.readouterr().err
     results = read_results(tmp_path / "out/results.json")
     assert results.runs == ("r0", "r2")
     assert results.left_out == {"r1": "NaN or infinity in snapshot 30"}
