@@ -139,7 +139,8 @@ def test_what_a_killed_packing_left_goes_with_the_next(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys; from weighttraj import atomic; "
         "from weighttraj.tools.pack import pack; "
-        "atomic.sync = lambda _: os.kill(os.getpid(), signal.SIGKILL); pack(sys.argv[1])"
+        "killed = lambda path: path.suffix == '.zip' and os.kill(os.getpid(), signal.SIGKILL); "
+        "atomic.sync = killed; pack(sys.argv[1])"
     )
     ended = subprocess.run([sys.executable, "-c", code, str(run.path)], check=False)
     assert ended.returncode == -signal.SIGKILL
