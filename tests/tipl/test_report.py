@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -286,3 +287,29 @@ def test_results_that_are_no_file_are_not_waited_for(tmp_path: Path) -> None:
         read_results(tmp_path / "results.json")
     with pytest.raises(FileNotFoundError, match="no results at"):
         read_results(tmp_path / "others.json")
+
+
+STRANGE = "<img src=x>`|[x](https://x.org)\n# head\x1b[2J"
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_a_strangers_result_file_adds_no_markup_to_a_page(
+    section: str, demo: dict[str, Any]
+) -> None:
+    """Names, runs, reasons and commands are quoted: no HTML, link, heading or end of code."""
+    changed = demo | {
+        "data": STRANGE,
+        "command": STRANGE,
+        "runs": [STRANGE],
+        "left_out": {STRANGE: STRANGE},
+        "failed": {STRANGE: STRANGE},
+        "forecasters": demo["forecasters"] | {STRANGE: demo["forecasters"]["tipl"]},
+    }
+    said = render(typed(changed), DEMO, section)
+    plain = render(typed(demo), DEMO, section)
+    outside = re.sub("`[^`\n]*`", "", re.sub(r"\\.", "", said))
+    assert "<img" not in outside
+    assert not re.search(r"\[x\]\(", outside)
+    assert "\n# head" not in said
+    assert "\x1b" not in said
+    assert said.count("|---|") == plain.count("|---|")

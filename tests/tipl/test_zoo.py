@@ -327,7 +327,7 @@ def test_a_card_keeps_its_prose(
     text = card.read_text()
     assert text.startswith("---\nlicense: mit\n")
     assert "## What is ours" in text
-    assert "datasets:\n- small\n" in text
+    assert 'datasets:\n- "small"\n' in text
     assert {place.section for place in places(text) if not place.empty} == {
         "summary",
         "baselines",
@@ -453,7 +453,7 @@ def test_a_gate_is_released_with_its_data_sets(
     evaluate([load(out)], judged)
     release(out, "tipl-gate-small", results=judged.out / "results.json")
     text = write_card("tipl-gate-small", tmp_path / "cards").read_text()
-    assert "datasets:\n- small\n- other\n" in text
+    assert 'datasets:\n- "small"\n- "other"\n' in text
     assert text.count("- trained on: ") == 2
     assert "tipl train gate --data small other --out FOLDER --starts 20 --n-batches 4" in text
     assert " --horizons 1 5 " in text

@@ -12,6 +12,7 @@ import jinja2
 from tipl.evaluation.leaderboard import Entry, Leaderboard, TaskScore
 from tipl.evaluation.results import Interval
 from weighttraj.atomic import replace_file
+from weighttraj.text import markdown as escaped
 
 COLUMNS = ("tasks", "score", "error ratio", "wins", "wins over rival", "rank")
 """Columns of a leaderboard behind the forecaster."""
@@ -64,7 +65,7 @@ def _by_task(board: Leaderboard) -> list[tuple[TaskScore, str]]:
 
 
 def _name(entry: Entry) -> str:
-    name = entry.forecaster.replace("|", "\\|")
+    name = escaped(entry.forecaster)
     return f"{name} (bound)" if entry.oracle else name
 
 

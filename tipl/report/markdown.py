@@ -29,6 +29,7 @@ from tipl.evaluation.results import Results
 from tipl.report.figures import figures, file_name, png, titles
 from tipl.report.tables import Table, cell, headline, label, tables
 from tipl.report.verdict import paragraphs
+from weighttraj import text
 from weighttraj.atomic import replace_file
 
 SECTIONS = ("overview", "verdict", "tables", "figures", "source")
@@ -93,13 +94,13 @@ def rewrite(page: str, what: str, source: str, render: Callable[[str], str]) -> 
 def insert_markdown(results: Results, source: Path, page: Path) -> None:
     """Write every place of a result file in a Markdown page, and the pictures that it shows."""
     old = page.read_text(encoding="utf-8")
-    text = rewrite(old, "results", source.as_posix(), lambda s: render(results, source, s))
-    if (source.as_posix(), "figures") in {(place.source, place.section) for place in places(text)}:
+    new = rewrite(old, "results", source.as_posix(), lambda s: render(results, source, s))
+    if (source.as_posix(), "figures") in {(place.source, place.section) for place in places(new)}:
         folder = page.parent / source.stem
         for title, figure in figures(results).items():
             content = png(figure, dpi=DPI)
             replace_file(folder / file_name(title), content, root=folder.parent)
-    replace_file(page.resolve(), text.encode())
+    replace_file(page.resolve(), new.encode())
 
 
 def render(results: Results, source: Path, section: str) -> str:
@@ -139,8 +140,17 @@ def templates() -> jinja2.Environment:
         keep_trailing_newline=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["label"] = label
+    environment.filters |= {"label": label, "text": text.markdown, "code": code, "yaml": text.yaml}
     return environment
+
+
+def code(value: object) -> str:
+    r"""Return what stands between backticks: a result file may be a stranger's.
+
+    >>> code("a`b\n```")
+    "a'b\\n'''"
+    """
+    return text.printable(value).replace("`", "'")
 
 
 def section_of(template: str, section: str, context: dict[str, Any]) -> str:
@@ -157,7 +167,7 @@ def table_lines(table: Table) -> list[str]:
     ]
     for name, cells in table.rows:
         shown = " | ".join(cell(row, table.digits) for row in cells)
-        lines.append(f"| {label(name)} | {shown} |")
+        lines.append(f"| {text.markdown(label(name))} | {shown} |")
     return lines
 
 

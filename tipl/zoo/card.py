@@ -25,7 +25,7 @@ from tipl import registry
 from tipl.checks.results import CheckResults
 from tipl.errors import ModelError
 from tipl.report.figures import svg
-from tipl.report.markdown import rewrite, section_of, table_lines, templates
+from tipl.report.markdown import code, rewrite, section_of, table_lines, templates
 from tipl.report.scores import PERSISTENCE, oracles, row_at, wpe
 from tipl.report.tables import headline, label
 from tipl.report.verdict import verdict
@@ -184,7 +184,7 @@ def _commands(metrics: Metrics) -> str:
         ]
     elif metrics.trained_on and kind is not None and kind.command:
         commands.append(f"tipl train {kind.command} --data {data} --out FOLDER {given['']}")
-    return "\n".join(["```bash", *commands, metrics.results.command, "```"])
+    return "\n".join(["```bash", *map(code, (*commands, metrics.results.command)), "```"])
 
 
 def _option(setting: tuple[str, Any]) -> str:
