@@ -17,6 +17,7 @@ from tipl.checks.model import refit_of
 from tipl.checks.results import NULL
 from tipl.errors import ForecastError, LeftOutWarning, ModelError, TrainError
 from tipl.models.causal import Causal, CausalTrainConfig, train_causal
+from tipl.models.causal.data import unit_rows
 from tipl.models.causal.forecaster import CausalModelConfig
 from tipl.models.causal.network import CausalGPT
 from tipl.models.causal.train import CausalLearner
@@ -68,6 +69,12 @@ def test_it_moves_within_the_directions_of_the_path(runs: list[wt.Run]) -> None:
     path = np.linalg.svd(weights[:26] - weights[25], full_matrices=False)[2][:3]
     assert np.linalg.norm(moved) > 1e-4
     np.testing.assert_allclose(moved @ path.T @ path, moved, atol=1e-6)
+
+
+def test_the_unit_of_length_is_that_of_recent_or_of_the_first_steps() -> None:
+    assert unit_rows(50, CAUSAL) == slice(30, 51)
+    first = replace(CAUSAL, unit="first")
+    assert (unit_rows(50, first), unit_rows(7, first)) == (slice(0, 21), slice(0, 8))
 
 
 def test_early_starts_are_copied(runs: list[wt.Run]) -> None:

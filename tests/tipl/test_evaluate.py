@@ -352,10 +352,15 @@ def test_nothing_is_measured_twice(
     assert made == ["weights/persistence/seed0002"]
 
 
-def test_processes_find_the_same(
-    results: dict[str, Any], model: Path, config: EvaluateConfig, tmp_path: Path
+@pytest.mark.parametrize("scheduler", [None, "local"], ids=["processes", "cluster"])
+def test_processes_and_clusters_find_the_same(
+    scheduler: str | None,
+    results: dict[str, Any],
+    model: Path,
+    config: EvaluateConfig,
+    tmp_path: Path,
 ) -> None:
-    evaluate([load(model)], replace(config, out=tmp_path), workers=2)
+    evaluate([load(model)], replace(config, out=tmp_path), workers=2, scheduler=scheduler)
     assert json.loads((tmp_path / "results.json").read_text()) == results
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch.nn import functional
 
@@ -89,3 +91,14 @@ def test_heads_attend_as_in_torch() -> None:
     expected = block.proj(mixed.transpose(1, 2).reshape(3, 6, 16))
     attn_mask = attention_mask(torch.ones(3, 6, dtype=torch.bool))
     torch.testing.assert_close(block._attend(x, attn_mask), expected)
+
+
+def test_a_residual_network_begins_as_persistence_and_counts_in_steps() -> None:
+    tokens, timesteps, mask = inputs()
+    network = GPT(replace(CONFIG, residual=True)).eval()
+    assert torch.equal(network(tokens, timesteps, mask), tokens)
+    torch.nn.init.ones_(network.head.bias)
+    network.step_std.copy_(torch.tensor([1.0, 2.0, 3.0, 4.0]))
+    torch.testing.assert_close(
+        network(tokens, timesteps, mask) - tokens, network.step_std.expand(tokens.shape)
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -46,6 +47,17 @@ def line(board: Leaderboard, name: str) -> Entry:
     return found
 
 
+def test_the_cost_of_a_forecast_is_a_mean_over_tasks() -> None:
+    costs = {("one", "model"): 0.001, ("two", "model"): 0.003}
+    rows = [
+        msgspec.structs.replace(each, cpu_seconds=costs.get((each.task, each.forecaster)))
+        for each in made()
+    ]
+    board = leaderboard(rows, rival="rival", resamples=20)
+    assert line(board, "model").cpu_ms == pytest.approx(2.0)
+    assert line(board, "rival").cpu_ms is None
+
+
 def test_figures_are_what_they_say() -> None:
     board = leaderboard(made(), rival="rival", resamples=200)
     model = line(board, "model")
@@ -54,6 +66,8 @@ def test_figures_are_what_they_say() -> None:
     assert model.wins.value == pytest.approx(2 / 3)
     assert model.wins_over.value == pytest.approx(2 / 3)
     assert model.rank.value == pytest.approx((1 + 1 + 3) / 3)
+    leads = {score.task: score.lead.value for score in board.scores if score.forecaster == "model"}
+    assert leads == pytest.approx({"one": 0.4, "two": 0.1, "three": -0.3})
     persistence = line(board, "persistence")
     assert (persistence.score.value, persistence.ratio.value) == (0.0, pytest.approx(1.0))
     assert persistence.wins.value == 0.5
@@ -165,6 +179,6 @@ def test_pages_hold_every_line(tmp_path: Path) -> None:
     assert "<b>|" not in page
     text = markdown(board)
     assert "| model | 3 | 0.17 " in text
-    assert "| <b>\\| |" in text
+    assert "| \\<b\\>\\| |" in text
     lines = (tmp_path / "out/leaderboard.csv").read_text().splitlines()
-    assert len(lines) == 1 + len(board.scores) + 5 * len(board.entries)
+    assert len(lines) == 1 + 2 * len(board.scores) + 5 * len(board.entries)

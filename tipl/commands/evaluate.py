@@ -48,6 +48,8 @@ class EvaluateCommand(EvaluateConfig):
     """Data sets: paths or ids."""
     workers: int = 1
     """Number of processes; each has one thread and takes a run at a time."""
+    scheduler: str | None = None
+    """Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this machine."""
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
     """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
@@ -82,6 +84,7 @@ def _evaluate_on(args: EvaluateCommand, data: str, out: Path) -> list[str]:
         forecasters,
         config,
         workers=args.workers,
+        scheduler=args.scheduler,
         imports=args.imports,
         console=console,
         trained_on={

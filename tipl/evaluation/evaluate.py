@@ -33,6 +33,7 @@ def evaluate_only(
     imports: Sequence[str],
     console: Console,
     trained_on: Mapping[str, Seen] | None = None,
+    scheduler: str | None = None,
 ) -> Results:
     """Evaluate forecasters, and write ``results.json`` and ``rows.csv``.
 
@@ -43,10 +44,13 @@ def evaluate_only(
     dataset = wt.open_dataset(config.data)
     runs, left_out = _whole_runs(dataset.split(config.split).runs, config)
     _check_runs(runs, config)
-    config = _within(config, min(len(run) for run in runs) // 2)
+    config = replace(
+        _within(config, min(len(run) for run in runs) // 2),
+        out=config.out.absolute(),  # workers of a cluster run elsewhere
+    )
     tasks = [Task(path=run.path.absolute(), forecasters=everyone, config=config) for run in runs]
     starts_of(runs[0], config)  # refuses what is too short or has no returns before the work
-    with engine_of(workers, imports=imports) as engine:
+    with engine_of(workers, scheduler, imports) as engine:
         measured = _measure(tasks, engine, console)
     failed = {name: why for m in reversed(measured) for name, why in m.failed.items()}
     everyone = _without_failed(everyone, failed)

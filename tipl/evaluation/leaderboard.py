@@ -37,6 +37,8 @@ class TaskScore(msgspec.Struct, frozen=True, kw_only=True):
     horizon: int
     forecaster: str
     score: Interval
+    lead: Interval
+    """The score minus the chosen rival's, of the same draws; unset: rival not evaluated."""
     runs: int
     """Number of runs."""
     trainings: int
@@ -61,6 +63,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     """Share of tasks on which its score is above the chosen rival's; unset: rival not evaluated."""
     rank: Interval
     """Mean rank among the forecasters of a task; 1: the best. Equal scores share a rank."""
+    cpu_ms: float | None = None
+    """CPU milliseconds of one forecast of all horizons, a mean over the tasks that tell it."""
     oracle: bool = False
 
 
@@ -96,7 +100,8 @@ def leaderboard(
         EvaluateError: rows of one task come from different runs or data, or two evaluations
             disagree about a forecaster.
     """
-    cells, oracles = _collect(rows)
+    rows = list(rows)
+    (cells, oracles), cpu_ms = _collect(rows), _costs(rows)
     drawn: dict[Cell, dict[str, np.ndarray]] = {}
     scores = []
     for cell, forecasters in sorted(cells.items()):
@@ -104,7 +109,9 @@ def leaderboard(
         random = np.random.default_rng([seed, runs])
         picks = np.vstack([np.arange(runs), random.integers(runs, size=(resamples, runs))])
         drawn[cell] = {name: _scores(sums, picks, seed) for name, sums in forecasters.items()}
+        theirs = drawn[cell].get(rival)
         for name, values in drawn[cell].items():
+            lead = np.full_like(values, np.nan) if theirs is None else values - theirs
             scores.append(
                 TaskScore(
                     task=cell[0],
@@ -112,6 +119,7 @@ def leaderboard(
                     horizon=cell[2],
                     forecaster=name,
                     score=_interval(values, alone=runs == 1),
+                    lead=_interval(lead, alone=runs == 1),
                     runs=runs,
                     trainings=len(forecasters[name].error),
                 )
@@ -119,8 +127,21 @@ def leaderboard(
     entries = []
     for measure, horizon in sorted({cell[1:] for cell in cells}, key=lambda key: (key[0], key[1])):
         tasks = {cell[0]: drawn[cell] for cell in drawn if cell[1:] == (measure, horizon)}
-        entries += _entries(tasks, measure, horizon, rival, oracles, seed)
+        lines = _entries(tasks, measure, horizon, rival, oracles, seed)
+        entries += [msgspec.structs.replace(e, cpu_ms=cpu_ms.get(e.forecaster)) for e in lines]
     return Leaderboard(rival=rival, entries=tuple(entries), scores=tuple(scores))
+
+
+def _costs(rows: Iterable[TaskRow]) -> dict[str, float]:
+    """Return the CPU milliseconds of a forecast by forecaster, a mean over tasks."""
+    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        if row.cpu_seconds is not None and np.isfinite(row.cpu_seconds):
+            found[row.forecaster.partition("@")[0]][row.task].append(1_000 * row.cpu_seconds)
+    return {
+        name: float(np.mean([np.mean(each) for each in tasks.values()]))
+        for name, tasks in found.items()
+    }
 
 
 def _collect(rows: Iterable[TaskRow]) -> tuple[dict[Cell, dict[str, _Sums]], set[str]]:

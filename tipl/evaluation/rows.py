@@ -57,6 +57,10 @@ class TaskRow(msgspec.Struct, frozen=True, kw_only=True):
     """Whether it was trained on runs of this data set, of others, or on none."""
     oracle: bool = False
     """Whether it reads the true future, and so is a bound and not a forecast."""
+    wall_seconds: float | None = None
+    """Time that one forecast of all horizons took, a mean over the starts; unset: not measured."""
+    cpu_seconds: float | None = None
+    """CPU time of the same."""
 
 
 def rows_of(
@@ -73,6 +77,7 @@ def rows_of(
     """Yield the rows of what was measured, persistence's own among them."""
     for m in measured:
         for name in (name for name in m.weights if name not in failed):
+            wall, cpu = m.weights[name].get("seconds", (None, None))  # unset in old files
             for measure, horizons, error, reference in _sums(m, config, name, persistence):
                 for j, h in enumerate(horizons):
                     if np.isfinite(error[j]) and np.isfinite(reference[j]):
@@ -88,6 +93,8 @@ def rows_of(
                             reference=float(reference[j]),
                             trained_on=trained_on.get(name, "unknown"),
                             oracle=name in set(oracles),
+                            wall_seconds=wall if wall is None else float(wall),
+                            cpu_seconds=cpu if cpu is None else float(cpu),
                         )
 
 

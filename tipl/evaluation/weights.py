@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -24,6 +24,7 @@ SLOWEST = 60
 MAX_BYTES = 2**27
 """Bytes of the forecasts of one chunk of starts."""
 
+T = TypeVar("T")
 Tick = Callable[[int], None]
 """Progress callback, called with a number of starts."""
 
@@ -39,15 +40,37 @@ def squared_errors(
 
     Returns:
         ``squared``: float64 (start, horizon, tensor), a sum for each tensor of the layout.
+        ``seconds``: float64 (2,), wall and CPU seconds of a forecast, a mean over the starts.
     """
     offsets = [param.offset for param in run.layout.params]
-    parts = []
-    for chunk, found in _forecasts(forecaster, run, starts, horizons, run.layout.size):
+    parts, clock = [], Clock()
+    chunks = _forecasts(forecaster, run, starts, horizons, run.layout.size)
+    for chunk, found in clock.of(chunks):
         error = found - _later(weights_of(run), chunk, horizons)
         np.square(error, out=error)
         parts.append(np.add.reduceat(error, offsets, axis=2, dtype=np.float64))
         tick(len(chunk))
-    return {"squared": np.concatenate(parts)}
+    return {"squared": np.concatenate(parts), "seconds": clock.seconds / max(len(starts), 1)}
+
+
+class Clock:
+    """Measures how long the elements of an iterator take to be made."""
+
+    def __init__(self) -> None:
+        self.seconds: Float[np.ndarray, "2"] = np.zeros(2)
+        """Wall and CPU seconds so far."""
+
+    def of(self, made: Iterator[T]) -> Iterator[T]:
+        """Yield the elements."""
+        while True:
+            began = np.array([time.perf_counter(), time.process_time()])
+            try:
+                found = next(made)
+            except StopIteration:
+                return
+            finally:
+                self.seconds += [time.perf_counter(), time.process_time()] - began
+            yield found
 
 
 def divergences(

@@ -14,14 +14,15 @@ from tipl.evaluation.results import Interval
 from weighttraj.atomic import replace_file
 from weighttraj.text import markdown as escaped
 
-COLUMNS = ("tasks", "score", "error ratio", "wins", "wins over rival", "rank")
+COLUMNS = ("tasks", "score", "error ratio", "wins", "wins over rival", "rank", "CPU ms")
 """Columns of a leaderboard behind the forecaster."""
 
 
 def cells(entry: Entry, *, interval: bool = True) -> tuple[str, ...]:
     """Return the texts of a line's columns."""
     figures = (entry.score, entry.ratio, entry.wins, entry.wins_over, entry.rank)
-    return (str(entry.tasks), *(_text(figure, interval) for figure in figures))
+    cost = "-" if entry.cpu_ms is None else f"{entry.cpu_ms:.2g}"
+    return (str(entry.tasks), *(_text(figure, interval) for figure in figures), cost)
 
 
 def write_page(board: Leaderboard, out: Path) -> Path:
@@ -60,8 +61,8 @@ def _groups(board: Leaderboard) -> Iterator[tuple[tuple[str, int], list[Entry]]]
         yield key, [e for e in board.entries if (e.measure, e.horizon) == key]
 
 
-def _by_task(board: Leaderboard) -> list[tuple[TaskScore, str]]:
-    return [(score, _text(score.score, True)) for score in board.scores]
+def _by_task(board: Leaderboard) -> list[tuple[TaskScore, str, str]]:
+    return [(score, _text(score.score, True), _text(score.lead, True)) for score in board.scores]
 
 
 def _name(entry: Entry) -> str:
@@ -89,6 +90,7 @@ def _csv(board: Leaderboard) -> str:
     for score in board.scores:
         key = [score.task, score.measure, score.horizon, score.forecaster, "score"]
         writer.writerow([*key, *_numbers(score.score), 1])
+        writer.writerow([*key[:-1], "lead", *_numbers(score.lead), 1])
     for entry in board.entries:
         for figure in ("score", "ratio", "wins", "wins_over", "rank"):
             key = ["all", entry.measure, entry.horizon, entry.forecaster, figure]

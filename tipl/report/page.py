@@ -27,6 +27,7 @@ def evaluate(
     imports: Sequence[str] = (),
     console: Console | None = None,
     trained_on: Mapping[str, Seen] | None = None,
+    scheduler: str | None = None,
 ) -> Results:
     """Evaluate forecasters beside persistence; write ``results.json``, a page and figures.
 
@@ -41,6 +42,8 @@ def evaluate(
         console: where progress is shown; None: nowhere.
         trained_on: what forecasters were trained on, by name: runs of this data set, of others,
             or nothing; it stands in ``rows.csv``.
+        scheduler: address of a Dask scheduler whose workers do it instead, or ``local``; they must
+            see the data and ``config.out`` at the same paths.
 
     Returns:
         What ``results.json`` holds.
@@ -51,7 +54,13 @@ def evaluate(
         KeyboardInterrupt: it was stopped; the measurements stay.
     """
     results = evaluate_only(
-        forecasters, config, workers, imports, console or Console(quiet=True), trained_on
+        forecasters,
+        config,
+        workers,
+        imports,
+        console or Console(quiet=True),
+        trained_on,
+        scheduler,
     )
     write_report(results, config.out)
     return results

@@ -18,7 +18,7 @@ from tipl.training.starts import Example, StartExamples, draw_starts
 from weighttraj import Run
 
 SCALE_STEPS = 20
-"""Number of steps whose RMS norm is the unit."""
+"""Number of steps whose RMS norm is the unit of length."""
 POOL = 4096
 """Number of sampled parameters of a run, to measure displacements."""
 
@@ -52,7 +52,7 @@ def examples_of(
     for t in draw_starts(len(run), count, rng):
         if t < config.rank:
             continue
-        scale = local_scale(weights[max(0, t - SCALE_STEPS) : t + 1], counts)
+        scale = local_scale(weights[unit_rows(t, config)], counts)
         if scale == 0:
             continue
         prefix = bases.tokens(t)
@@ -110,6 +110,12 @@ def local_scale(
 ) -> float:
     """Return the RMS norm of the steps between snapshots; ``counts`` weighs the parameters."""
     return float(np.sqrt((np.diff(rows, axis=0) ** 2 * counts).sum(1).mean()))
+
+
+def unit_rows(t: int, config: CausalConfig) -> slice:
+    """Return the snapshots up to t whose steps give the unit of length."""
+    first = max(0, t - SCALE_STEPS) if config.unit == "recent" else 0
+    return slice(first, min(t, first + SCALE_STEPS) + 1)
 
 
 @while_open

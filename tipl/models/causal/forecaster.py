@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 from tipl.errors import RepresentationError
 from tipl.forecaster import check_cadence, check_request
 from tipl.horizons import rows_of
-from tipl.models.causal.data import SCALE_STEPS, bases_of, local_scale, view
+from tipl.models.causal.data import bases_of, local_scale, unit_rows, view
 from tipl.models.causal.network import CausalConfig, CausalGPT
 from tipl.runs import weights_of
 from tipl.saved import ModelConfig, SavedNetwork
@@ -71,8 +71,7 @@ class Causal(SavedNetwork[CausalGPT, CausalModelConfig]):
         sizes = self.config.network
         if t < sizes.rank:
             return None
-        recent = weights_of(run)[max(0, t - SCALE_STEPS) : t + 1].astype(np.float64)
-        scale = local_scale(recent)
+        scale = local_scale(weights_of(run)[unit_rows(t, sizes)].astype(np.float64))
         if scale == 0:
             return None
         bases = bases_of(run, sizes)

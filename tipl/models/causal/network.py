@@ -9,6 +9,7 @@ which begins at 0: persistence.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -39,6 +40,8 @@ class CausalConfig:
     """Number of attention heads."""
     n_embd: int = 64
     """Width of the residual stream."""
+    unit: Literal["recent", "first"] = "recent"
+    """Unit of length: the RMS norm of the last steps, or of the first steps of the run."""
 
     @property
     def states(self) -> int:

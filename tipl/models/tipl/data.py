@@ -112,6 +112,12 @@ class TokenSampler:
         rows = torch.from_numpy(np.concatenate(pieces))
         return rows.mean(0), rows.std(0, correction=0)
 
+    def step_size(self) -> Float[Tensor, " rank"]:
+        """Return the root mean square of each coefficient's steps over all runs."""
+        pieces = [self._rows[a : a + n] for a, n in zip(self._first, self._lengths, strict=True)]
+        steps = np.concatenate([np.diff(rows, axis=0) for rows in pieces])
+        return torch.from_numpy(steps).square().mean(0).sqrt()
+
     def batch(self, n: int) -> Windows:
         """Return batch number n."""
         rng = np.random.default_rng([self.seed, n])

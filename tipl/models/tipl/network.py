@@ -35,6 +35,9 @@ class GPTConfig:
     """Width of the residual stream."""
     dropout: float = 0.1
     """Dropout probability of embeddings, attention and residual branches."""
+    residual: bool = False
+    """Whether the network writes the step to the next token, not the token itself as in the paper.
+    It then begins as persistence."""
 
 
 class GPT(nn.Module):
@@ -42,6 +45,7 @@ class GPT(nn.Module):
 
     input_mean: Tensor
     input_std: Tensor
+    step_std: Tensor
 
     def __init__(self, config: GPTConfig) -> None:
         super().__init__()
@@ -49,6 +53,8 @@ class GPT(nn.Module):
         # The constants of the normalisation are buffers, so they are saved with the parameters.
         self.register_buffer("input_mean", torch.zeros(config.rank))
         self.register_buffer("input_std", torch.ones(config.rank))
+        if config.residual:
+            self.register_buffer("step_std", torch.ones(config.rank))
         self.embed_token = nn.Linear(config.rank, config.n_embd)
         self.embed_timestep = nn.Embedding(config.max_timestep, config.n_embd)
         self.embed_norm = nn.LayerNorm(config.n_embd)
@@ -57,6 +63,9 @@ class GPT(nn.Module):
         self.final_norm = nn.LayerNorm(config.n_embd)
         self.head = nn.Linear(config.n_embd, config.rank)
         self.blocks.apply(_init_gpt2)
+        if config.residual:
+            nn.init.zeros_(self.head.weight)
+            nn.init.zeros_(self.head.bias)
 
     def forward(
         self,
@@ -78,7 +87,7 @@ class GPT(nn.Module):
         for block in self.blocks:
             x = block(x, attn_mask)
         predicted: Tensor = self.head(self.final_norm(x))  # (batch, window, rank)
-        return predicted
+        return tokens + predicted * self.step_std if self.config.residual else predicted
 
 
 class Block(nn.Module):

@@ -128,6 +128,8 @@ class TIPLLearner(Learner[Windows]):
         mean, std = self._sampler.moments()
         self.network.input_mean.copy_(mean)
         self.network.input_std.copy_(std + 1e-6)
+        if sizes.residual:
+            self.network.step_std.copy_(self._sampler.step_size())
 
     def settings(self) -> dict[str, Any]:
         """Return what train.json says of the training."""
