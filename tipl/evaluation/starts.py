@@ -9,10 +9,8 @@ from jaxtyping import Bool, Float, Int
 
 from tipl.errors import EvaluateError
 from tipl.evaluation.config import EvaluateConfig
-from weighttraj import Run
+from weighttraj import Run, learning
 
-LEARNED = 0.95
-"""Share of the way from the first to the final return at which the learning phase ends."""
 DENSE = 64
 """Number of first snapshots that are always starts: the longest steps are there, and a few of them
 dominate a sum over starts."""
@@ -64,8 +62,7 @@ def starts_of(run: Run, config: EvaluateConfig) -> Starts:
 def learning_phase(run: Run) -> int:
     """Return the first snapshot whose return is 95 % of the way from the first to the final one.
 
-    The final return is the median over the last quarter of the evaluated snapshots. Returns of
-    sampled actions are used if they are stored, because deterministic ones can jump.
+    Returns of sampled actions are used if they are stored, because deterministic ones can jump.
 
     Raises:
         EvaluateError: the run has no returns.
@@ -77,11 +74,8 @@ def learning_phase(run: Run) -> int:
             where=run.path,
             do="weighttraj returns DATASET, or --learning-starts 0 to evaluate weights only",
         )
-    mean = run.mean_return(deterministic=False not in run.evaluation.deterministic)
-    rows = np.flatnonzero(np.isfinite(mean))
-    final = np.median(mean[rows[-max(1, len(rows) // 4) :]])
-    reached = (mean[rows] - mean[rows[0]]) >= LEARNED * (final - mean[rows[0]])
-    return int(rows[np.flatnonzero(reached)[0]]) if final > mean[rows[0]] else 0
+    sampled = False in run.evaluation.deterministic
+    return learning.learning_phase(run.mean_return(deterministic=not sampled))
 
 
 def at_boundary(run: Run, starts: Int[np.ndarray, " start"]) -> Bool[np.ndarray, " start"]:
