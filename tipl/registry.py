@@ -264,6 +264,7 @@ for _kind in (
         refit="tipl.models.baselines.train:refit_regression",
     ),
     _baseline("persistence", "naive:Persistence"),
+    _baseline("path-oracle", "reconstruction:PathOracle"),
     _baseline("extrapolation", "naive:Extrapolation"),
     _baseline("dmd", "subspace:DMD"),
     _baseline("wnn", "nowcasters:WNN", "refit_nowcaster"),

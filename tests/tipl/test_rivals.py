@@ -9,9 +9,11 @@ import pytest
 
 import weighttraj as wt
 from tipl.checks.copies import run_like
+from tipl.errors import ForecastError
 from tipl.models.baselines.data import Trajectory
 from tipl.models.baselines.features import Features
 from tipl.models.baselines.naive import Extrapolation
+from tipl.models.baselines.reconstruction import PathOracle
 from tipl.models.baselines.rivals import (
     LastIteration,
     LeadingDirections,
@@ -110,3 +112,19 @@ def test_rivals_have_names_and_can_be_saved(name: str, template: wt.Run, tmp_pat
     rival.save(tmp_path / name)
     expected = rival.forecast(template, [20], [1, 5])
     assert np.array_equal(load(tmp_path / name).forecast(template, [20], [1, 5]), expected)
+
+
+def test_the_path_oracle_knows_what_lies_in_the_directions_of_the_path(
+    template: wt.Run, tmp_path: Path
+) -> None:
+    along, aside = np.linalg.qr(np.random.default_rng(0).normal(size=(P, 2)))[0].T
+    time = np.arange(80)[:, None]
+    path = 1e-2 * time * along + np.maximum(0, time - 40) * aside  # it turns after snapshot 40
+    run = run_like(template, path, tmp_path)
+    oracle = PathOracle()
+    assert oracle.is_oracle
+    moved = oracle.forecast(run, [40, 60], [10])[:, 0] - run.weights[[40, 60]]
+    np.testing.assert_allclose(moved[0], 0.1 * along, atol=1e-4)
+    np.testing.assert_allclose(moved[1], 0.1 * along + 10 * aside, atol=1e-4)
+    with pytest.raises(ForecastError, match="the run ends before"):
+        oracle.forecast(run, [79], [1])

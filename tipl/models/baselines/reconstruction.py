@@ -1,4 +1,4 @@
-"""The reconstruction oracle: no forecast, but the truth as a basis of rank d shows it."""
+"""Oracles: no forecasts, but the truth as far as a basis of rank d shows it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from jaxtyping import Float32
 
 from tipl.errors import ForecastError
 from tipl.forecaster import check_request
+from tipl.models.baselines.data import Trajectory
+from tipl.models.baselines.rivals import leading
 from tipl.representation import embed
 from tipl.saved import SavedSettings
 from weighttraj import Run
@@ -41,15 +43,59 @@ class Reconstruction(SavedSettings):
         Raises:
             ForecastError: the run ends before.
         """
-        check_request(run, starts, horizons)
-        if max(starts) + max(horizons) >= len(run):
-            raise ForecastError(
-                "the run ends before, so the truth is not known",
-                expected=f"start and horizon of at most {len(run) - 1} together",
-                got=max(starts) + max(horizons),
-                where=run.path,
-            )
+        check_known(run, starts, horizons)
         embedded = embed(run, self.rank)
         later = np.asarray(starts)[:, None] + np.asarray(horizons)
         back = embedded.svd.inverse_transform(embedded.coefficients[later])
         return back.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class PathOracle(SavedSettings):
+    """The true displacement, projected onto the leading directions of the path up to t.
+
+    A model that moves within d directions that the policy has already taken cannot have a smaller
+    error, whatever it predicts along them.
+    """
+
+    rank: int = 16
+    """Number of directions."""
+    window: int = 256
+    """Largest number of snapshots whose path gives the directions."""
+    kind = "path-oracle"
+    causal = False
+    is_oracle = True
+
+    @property
+    def name(self) -> str:
+        """Name in tables and figures."""
+        return f"path-oracle-{self.rank}"
+
+    def forecast(
+        self, run: Run, starts: Sequence[int], horizons: Sequence[int]
+    ) -> Float32[np.ndarray, "start horizon param"]:
+        """Return phi_t and the projected displacement.
+
+        Raises:
+            ForecastError: the run ends before.
+        """
+        check_known(run, starts, horizons)
+        trajectory = Trajectory.of(run)
+        out = np.empty((len(starts), len(horizons), run.layout.size), np.float32)
+        for place, path in trajectory.windows(starts, self.window - 1):
+            directions = leading(path - path.mean(0), self.rank)  # (direction, param)
+            true = trajectory.weights[starts[place] + np.asarray(horizons)] - path[-1]
+            out[place] = path[-1] + true @ directions.T @ directions
+        return out
+
+
+def check_known(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> None:
+    """Refuse a request for snapshots that the run does not have."""
+    check_request(run, starts, horizons)
+    if max(starts) + max(horizons) >= len(run):
+        raise ForecastError(
+            "the run ends before, so the truth is not known",
+            expected=f"start and horizon of at most {len(run) - 1} together",
+            got=max(starts) + max(horizons),
+            where=run.path,
+        )
