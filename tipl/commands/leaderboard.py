@@ -17,6 +17,12 @@ from weighttraj.remote.address import new_path
 from weighttraj.terminal import Output, say
 
 
+WIDE = 110
+"""Number of characters that a table with all columns needs."""
+NARROW = (1, 4, 5)
+"""Columns of a narrower one: score, wins over the rival, rank."""
+
+
 def leaderboard(
     results: Annotated[
         tyro.conf.Positional[tuple[Path, ...]],
@@ -42,7 +48,7 @@ def leaderboard(
     page = write_page(board, out)
     console = Output()
     for measure, horizon in dict.fromkeys((e.measure, e.horizon) for e in board.entries):
-        console.print(_table(board, measure, horizon))
+        console.print(_table(board, measure, horizon, console))
     say(f"leaderboard: {page}")
 
 
@@ -61,13 +67,16 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _table(board: Leaderboard, measure: str, horizon: int) -> Table:
+def _table(board: Leaderboard, measure: str, horizon: int, console: Output) -> Table:
+    """Return the lines of one measure and horizon; few columns where there is no room for all."""
+    shown = range(len(COLUMNS)) if console.width >= WIDE else NARROW
     table = Table(title=f"{measure}, {horizon} snapshots ahead")
-    table.add_column("forecaster", no_wrap=True)
-    for column in COLUMNS:
-        table.add_column(column, justify="right")
+    table.add_column("forecaster", overflow="fold")
+    for i in shown:
+        table.add_column(COLUMNS[i], justify="right", no_wrap=True)
     for entry in board.entries:
         if (entry.measure, entry.horizon) == (measure, horizon):
             name = f"{entry.forecaster} (bound)" if entry.oracle else entry.forecaster
-            table.add_row(escape(name), *cells(entry, interval=False))
+            texts = cells(entry, interval=False)
+            table.add_row(escape(name), *(texts[i] for i in shown))
     return table
