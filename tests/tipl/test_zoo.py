@@ -42,7 +42,7 @@ from tipl.report.scores import SKILL
 from tipl.saved import fingerprint
 from tipl.zoo.card import facts, metrics_of, refreshed, write_card
 from tipl.zoo.metrics import read_metrics
-from tipl.zoo.release import LINES, MOST, release, thinned
+from tipl.zoo.release import LINES, MOST, release, task_scores, thinned
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info
 
 ROOT = Path(__file__).parents[2]
@@ -451,8 +451,13 @@ def test_a_gate_is_released_with_its_data_sets(
     few = {"horizons": (1, 5), "learning_starts": 0, "function_starts": 0, "bootstrap": 10}
     judged = EvaluateConfig(data=small_dataset, out=tmp_path / "judged", starts=9, **few)
     evaluate([load(out)], judged)
-    release(out, "tipl-gate-small", results=judged.out / "results.json")
+    rows = judged.out / "rows.csv"
+    rows.write_text(rows.read_text().replace(",model,", ",tipl-gate-small@0,"))
+    release(out, "tipl-gate-small", results=judged.out / "results.json", rows=[rows])
     text = write_card("tipl-gate-small", tmp_path / "cards").read_text()
+    assert "| task | skill, h = 1 |\n|---|---:|\n| `small` | " in text
+    with pytest.raises(ModelError, match="the rows hold no scores"):
+        task_scores("tipl-gate", [rows])
     assert 'datasets:\n- "small"\n- "other"\n' in text
     assert text.count("- trained on: ") == 2
     assert "tipl train gate --data small other --out FOLDER --starts 20 --n-batches 4" in text

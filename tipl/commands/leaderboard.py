@@ -16,7 +16,6 @@ from tipl.report.leaderboard import COLUMNS, cells, write_page
 from weighttraj.remote.address import new_path
 from weighttraj.terminal import Output, say
 
-
 WIDE = 110
 """Number of characters that a table with all columns needs."""
 NARROW = (1, 4, 5)

@@ -22,10 +22,13 @@ def release(
         Path | None, tyro.conf.arg(help="results.json that evaluated the model of the zoo")
     ] = None,
     checks: Annotated[Path | None, tyro.conf.arg(help="what `tipl check` wrote of it")] = None,
+    rows: Annotated[
+        tuple[Path, ...], tyro.conf.arg(help="rows.csv of several tasks, for the card")
+    ] = (),
     log: Annotated[bool, tyro.conf.arg(help="keep some lines of the training's log")] = True,
 ) -> None:
     """Put a model into the zoo: first as a draft, then with the results of its evaluation there."""
-    out = release_model(here(folder), name, results=results, checks=checks, log=log)
+    out = release_model(here(folder), name, results=results, checks=checks, rows=rows, log=log)
     say(f"model in {out}")
     if read_metrics(out) is None:
         say(f"a draft: evaluate it with `tipl evaluate {name} ...`, then give --results")

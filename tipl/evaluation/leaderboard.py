@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tipl.errors import EvaluateError
-from tipl.evaluation.results import Interval
+from tipl.evaluation.results import Interval, TaskScore
 from tipl.evaluation.rows import TaskRow
 
 PERSISTENCE = "persistence"
@@ -27,22 +27,6 @@ CLIP = 1.0
 
 Cell = tuple[str, str, int]
 """Task, measure and horizon."""
-
-
-class TaskScore(msgspec.Struct, frozen=True, kw_only=True):
-    """The score of a forecaster on one task, at one horizon."""
-
-    task: str
-    measure: str
-    horizon: int
-    forecaster: str
-    score: Interval
-    lead: Interval
-    """The score minus the chosen rival's, of the same draws; unset: rival not evaluated."""
-    runs: int
-    """Number of runs."""
-    trainings: int
-    """Number of trainings of the forecaster."""
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):

@@ -90,6 +90,22 @@ class StartCounts(msgspec.Struct, frozen=True, kw_only=True):
     plateau: int
 
 
+class TaskScore(msgspec.Struct, frozen=True, kw_only=True):
+    """The score of a forecaster on one task, at one horizon."""
+
+    task: str
+    measure: str
+    horizon: int
+    forecaster: str
+    score: Interval
+    lead: Interval
+    """The score minus the chosen rival's, of the same draws; unset: rival not evaluated."""
+    runs: int
+    """Number of runs."""
+    trainings: int
+    """Number of trainings of the forecaster."""
+
+
 class Results(msgspec.Struct, frozen=True, kw_only=True):
     """What ``results.json`` holds."""
 

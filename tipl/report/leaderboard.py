@@ -9,8 +9,8 @@ from pathlib import Path
 
 import jinja2
 
-from tipl.evaluation.leaderboard import Entry, Leaderboard, TaskScore
-from tipl.evaluation.results import Interval
+from tipl.evaluation.leaderboard import Entry, Leaderboard
+from tipl.evaluation.results import Interval, TaskScore
 from weighttraj.atomic import replace_file
 from weighttraj.text import markdown as escaped
 

@@ -27,7 +27,7 @@ from tipl.errors import ModelError
 from tipl.report.figures import svg
 from tipl.report.markdown import code, rewrite, section_of, table_lines, templates
 from tipl.report.scores import PERSISTENCE, oracles, row_at, wpe
-from tipl.report.tables import headline, label
+from tipl.report.tables import cell, headline, label
 from tipl.report.verdict import verdict
 from tipl.zoo.metrics import Metrics, read_metrics
 
@@ -115,6 +115,7 @@ def facts(metrics: Metrics, section: str) -> str:
         "tests": _TESTS,
         "headline": headline,
         "measured": _measured,
+        "cell": cell,
         "table_lines": table_lines,
         "verdict": verdict,
     }

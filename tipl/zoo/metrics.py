@@ -10,7 +10,7 @@ import msgspec
 
 from tipl.checks.results import CheckResults
 from tipl.errors import ModelError
-from tipl.evaluation.results import Results, Scores
+from tipl.evaluation.results import Results, Scores, TaskScore
 
 FILE = "metrics.json"
 
@@ -57,6 +57,8 @@ class Metrics:
     """Settings of the training."""
     log: list[dict[str, float]] = field(default_factory=list)
     """Some lines of the training's log: ``batch``, and errors on training and validation runs."""
+    tasks: tuple[TaskScore, ...] = ()
+    """Scores on several tasks, of all trainings of the model, from the rows of a leaderboard."""
     checks: CheckResults | None = None
     """What ``tipl check`` wrote; None: not checked."""
 

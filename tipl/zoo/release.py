@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +31,9 @@ import weighttraj as wt
 from tipl import registry
 from tipl.checks.results import CheckResults, read_checks
 from tipl.errors import ModelError
-from tipl.evaluation.results import Results, Scores, read_results, write_document
+from tipl.evaluation.leaderboard import leaderboard
+from tipl.evaluation.results import Results, Scores, TaskScore, read_results, write_document
+from tipl.evaluation.rows import read_rows
 from tipl.forecaster import every_of
 from tipl.report.scores import REPW, SKILL, function_skill, oracles, shown
 from tipl.saved import ARRAYS, CONFIG, fingerprint
@@ -38,6 +41,8 @@ from tipl.zoo.metrics import FILE, Metrics, TrainedOn, read_metrics
 
 MOST = 3_000_000
 """Largest size of a model's arrays in bytes, after rounding to float16 if necessary."""
+ON_CARDS = (("skill", 1), ("skill", 10), ("skill", 200), ("gain", 50))
+"""Measures and horizons that a card shows for each of several tasks."""
 LINES = 100
 """Number of lines of a training's log that are kept."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9.-]*")
@@ -62,6 +67,7 @@ def release(
     *,
     results: Path | None = None,
     checks: Path | None = None,
+    rows: Sequence[Path] = (),
     log: bool = True,
 ) -> Path:
     """Copy a forecaster into the zoo, with what is known of it; return its folder there.
@@ -74,6 +80,8 @@ def release(
         name: name in the zoo.
         results: a results.json in which the model of the zoo was evaluated; None: a draft.
         checks: what ``tipl check`` wrote of it.
+        rows: CSV files of several tasks in which it was evaluated by its name in the zoo, as a
+            whole or by trainings ``NAME@0``, ``NAME@1``, ...
         log: keep some lines of the training's log.
 
     Raises:
@@ -86,6 +94,8 @@ def release(
         draft = Path(scratch) / name
         _copy(folder, draft)
         metrics = _metrics(folder, draft, results=results, checks=checks, log=log)
+        if metrics is not None and rows:
+            metrics = replace(metrics, tasks=task_scores(name, rows))
         shutil.copytree(draft, out, dirs_exist_ok=True)
     if metrics is None:
         (out / FILE).unlink(missing_ok=True)
@@ -117,8 +127,32 @@ def _metrics(
         evaluated_as=evaluated_as,
         results=reduced(document, evaluated_as),
         **_training(folder, known, log),
+        tasks=known.tasks if known else (),
         checks=checked,
     )
+
+
+def task_scores(name: str, rows: Sequence[Path]) -> tuple[TaskScore, ...]:
+    """Return the scores of one forecaster on all tasks, at the horizons that a card shows.
+
+    Raises:
+        ModelError: the rows have no forecaster of this name.
+    """
+    board = leaderboard(row for file in rows for row in read_rows(file))
+    found = tuple(
+        score
+        for score in board.scores
+        if score.forecaster == name and (score.measure, score.horizon) in ON_CARDS
+    )
+    if not found:
+        raise ModelError(
+            "the rows hold no scores of the model",
+            expected=f"a forecaster {name} or {name}@0 in rows.csv",
+            got=sorted({score.forecaster for score in board.scores}),
+            where=", ".join(map(str, rows)),
+            do="evaluate the model by this name, or in a folder of this name",
+        )
+    return found
 
 
 def _training(folder: Path, known: Metrics | None, log: bool) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,6 +44,13 @@ class Causal(SavedNetwork[CausalGPT, CausalModelConfig]):
     def build(cls, config: CausalModelConfig) -> CausalGPT:
         """Return an untrained network."""
         return CausalGPT(config.network)
+
+    def document(self) -> dict[str, Any]:
+        """Return what config.json says; the default ``unit`` is left out."""
+        document = super().document()
+        if self.config.network.unit == "recent":
+            del document["network"]["unit"]
+        return document
 
     @torch.no_grad()
     def forecast(

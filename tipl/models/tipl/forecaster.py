@@ -57,8 +57,11 @@ class TIPL(SavedNetwork[GPT, TIPLConfig]):
         return (Reconstruction(self.config.gpt.rank),)
 
     def document(self) -> dict[str, Any]:
-        """Return what config.json says."""
-        return {**asdict(self.config), "kind": self.kind}
+        """Return what config.json says; ``residual`` is left out where it is not used."""
+        sizes = asdict(self.config)
+        if not self.config.gpt.residual:
+            del sizes["gpt"]["residual"]
+        return {**sizes, "kind": self.kind}
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
