@@ -2,9 +2,6 @@
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := data/demo
-RELEASED := inverted-pendulum-v4-ppo-v1
-# Baselines that are followed further, as tipl-drift follows the gate.
-RIVALS := last-step trend-20 ema-0.9 data/results/ladder/ar-20-phase
 # The processes that tests start share compiled code: without it each compiles both packages again.
 PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
 
@@ -57,12 +54,8 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_recipes.py --save
 	$(BIN)/python tests/benchmarks/results.py
 
-results: setup ## judge the zoo and the baselines, write docs/results.md: two hours
-	$(BIN)/tipl train baselines --data $(RELEASED) --out data/results/ladder
-	for along in $(RIVALS); do $(BIN)/tipl train scaled --along $$along --data $(RELEASED) --out data/results/further/$$(basename $$along)-further --amplitudes 0.25 0.5 1 1.5 2 3 4 6 8 || exit 1; done
-	$(BIN)/tipl evaluate tipl-inverted-pendulum-v4 tipl-gate-inverted-pendulum-v4 tipl-drift-inverted-pendulum-v4 tipl-causal-inverted-pendulum-v4 data/results/ladder/* data/results/further/* --data $(RELEASED) --out data/results/full --return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1 --workers 2
-	cp data/results/full/results.json docs/results/$(RELEASED).json
-	$(BIN)/tipl report docs/results/$(RELEASED).json --into docs/results.md
+results: setup ## say what it costs, then train and evaluate every forecaster, and write docs/results.md
+	$(BIN)/python docs/results/arbiter.py --run
 
 stress: setup ## kill, flip, delete, fuzz: about an hour
 	$(BIN)/python -W ignore tests/benchmarks/stress_format.py

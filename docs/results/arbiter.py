@@ -56,10 +56,17 @@ TASKS = {
 LADDER_TASKS = tuple(task for task in TASKS if TASKS[task] in LADDER)
 """Tasks of the ladder from TIPL to tipl-gate."""
 SEEDS = (0, 1, 2)
-TUNED = ("last-iteration", "ema-0.9", "gate", "trend-20", "ar-20-phase", "relex-50")
+TUNED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase", "relex-50")
 """Forecasts that are stretched by what the returns of validation runs say, all with one grid."""
 AMPLITUDES = "0.125 0.25 0.5 1 2 4"
-LEARNED = ("gate", "gate-tuned", "gate-elsewhere", "ar-20-phase", "ar-20-phase-tuned", "wnn")
+LEARNED = (
+    "tipl-gate",
+    "tipl-gate-tuned",
+    "gate-elsewhere",
+    "ar-20-phase",
+    "ar-20-phase-tuned",
+    "wnn",
+)
 """Forecasters that are trained, and evaluated by returns."""
 SIMPLE = "last-iteration-tuned"
 """What a learned forecast has to beat in return."""
@@ -72,7 +79,7 @@ RUNGS = {
     "causal-first": "+ basis of the path so far, a head for each horizon",
     "causal": "+ measured in the steps around the start",
     "gate-own": "one small network for all parameters (tipl-gate)",
-    "gate": "+ trained on all seven tasks",
+    "tipl-gate": "+ trained on all seven tasks",
 }
 """The ladder: each line changes one thing."""
 
@@ -89,7 +96,7 @@ def plan() -> list[Step]:
     """Return all commands in order."""
     everything = " ".join(TASKS)
     gates = [
-        f"tipl train gate --without time --data {everything} --out {OUT}/all/gate@{s} --seed {s}"
+        f"tipl train gate --without time --data {everything} --out {OUT}/all/tipl-gate@{s} --seed {s}"
         for s in SEEDS
     ]
     gates += [
@@ -144,7 +151,7 @@ def _ladder() -> Iterator[str]:
 def _tuned() -> Iterator[str]:
     for name in TUNED:
         for task in TASKS:
-            along = {"gate": f"{OUT}/all/gate@0", RIVAL: f"{OUT}/{task}/ladder/{RIVAL}"}
+            along = {"tipl-gate": f"{OUT}/all/tipl-gate@0", RIVAL: f"{OUT}/{task}/ladder/{RIVAL}"}
             yield (
                 f"tipl train scaled --along {along.get(name, name)} --data {task} "
                 f"--out {OUT}/{task}/{name}-tuned --horizons 50 100 --amplitudes {AMPLITUDES} "
@@ -160,7 +167,7 @@ def _in_weights() -> list[str]:
         *simple,
         *rivals,
         *(f"{OUT}/{{data}}/ladder/{name}" for name in fitted),
-        *(f"{OUT}/all/gate@{seed}" for seed in SEEDS),
+        *(f"{OUT}/all/tipl-gate@{seed}" for seed in SEEDS),
         f"{OUT}/all/gate-timed@0",
         f"{OUT}/{{data}}/gate-elsewhere@0",
         "tipl.models.baselines.reconstruction:PathOracle",
@@ -170,7 +177,7 @@ def _in_weights() -> list[str]:
 def _in_returns() -> list[str]:
     return [
         *(f"{OUT}/{{data}}/{name}-tuned" for name in TUNED),
-        f"{OUT}/all/gate@0",
+        f"{OUT}/all/tipl-gate@0",
         f"{OUT}/{{data}}/gate-elsewhere@0",
         *(f"{OUT}/{{data}}/ladder/{name}" for name in (RIVAL, "wnn")),
         "pptb-4",
@@ -179,7 +186,7 @@ def _in_returns() -> list[str]:
 
 
 def _on_ladder() -> list[str]:
-    names = [name for name in RUNGS if name != "gate"]
+    names = [name for name in RUNGS if name != "tipl-gate"]
     return [
         f"{OUT}/{{data}}/{name}@{seed}"
         for name in names
@@ -309,8 +316,8 @@ def page(rows: Sequence[TaskRow]) -> dict[str, str]:
 
 def answers(rows: Sequence[TaskRow], weights: Board, returns: Board) -> str:
     """Return the answers to the page's questions, a line each."""
-    ahead, clear, tasks = weights.wins("gate", "skill", 10)
-    first, first_clear, _ = weights.wins("gate", "skill", 1)
+    ahead, clear, tasks = weights.wins("tipl-gate", "skill", 10)
+    first, first_clear, _ = weights.wins("tipl-gate", "skill", 1)
     lines = [
         "1. **Does something learned beat the last iteration, stretched, in return?** "
         + _beaten(returns),
@@ -408,7 +415,7 @@ def _spread(rows: Sequence[TaskRow]) -> float:
                     row
                     for row in rows
                     if (row.task, row.measure, row.horizon, row.forecaster)
-                    == (task, "skill", h, f"gate@{seed}")
+                    == (task, "skill", h, f"tipl-gate@{seed}")
                 ]
                 if mine:
                     skills.append(1 - sum(r.error for r in mine) / sum(r.reference for r in mine))
@@ -462,7 +469,7 @@ def transfer_table(board: Board) -> str:
     for task, called in TASKS.items():
         cells = []
         for h in (1, 10):
-            for name in (RIVAL, "gate", "gate-elsewhere"):
+            for name in (RIVAL, "tipl-gate", "gate-elsewhere"):
                 score = board.score(task, name, "skill", h)
                 cells.append(_cell(score and score.score, name != RIVAL))
         lines.append(f"| {called} | {' | '.join(cells)} |")
@@ -517,7 +524,7 @@ def lead_figure(board: Board) -> Figure:
     fig = Figure(figsize=(8, 3.4), layout="constrained")
     for axes, h in zip(fig.subplots(1, 2, sharey=True), (1, 10), strict=True):
         for shift, (name, label, color) in enumerate(
-            (("gate", "saw the task", "#c0392b"), ("gate-elsewhere", "did not", "#2471a3"))
+            (("tipl-gate", "saw the task", "#c0392b"), ("gate-elsewhere", "did not", "#2471a3"))
         ):
             for place, task in enumerate(TASKS):
                 score = board.score(task, name, "skill", h)
@@ -564,7 +571,7 @@ def gain_figure(board: Board) -> Figure:
     """Draw the gain at h = 50 on each task, of the best learned forecast and of simple ones."""
     fig = Figure(figsize=(8, 3.6), layout="constrained")
     axes = fig.subplots()
-    shown = [("gate-tuned", "#c0392b"), ("gate", "#e67e22"), ("ema-0.9-tuned", "#17a589")]
+    shown = [("tipl-gate-tuned", "#c0392b"), ("tipl-gate", "#e67e22"), ("ema-0.9-tuned", "#17a589")]
     for shift, (name, color) in enumerate([*shown, (SIMPLE, "#2471a3")]):
         for place, task in enumerate(TASKS):
             score = board.score(task, name, "gain", 50)

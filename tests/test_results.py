@@ -1,0 +1,56 @@
+"""The results page says what the rows in the repository say."""
+
+from __future__ import annotations
+
+import importlib.util
+import shlex
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from tipl.evaluation.rows import read_rows
+
+HERE = Path(__file__).parents[1] / "docs/results"
+
+
+@pytest.fixture(scope="module")
+def arbiter() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("arbiter", HERE / "arbiter.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_says_what_the_rows_say(arbiter: ModuleType) -> None:
+    page = arbiter.PAGE.read_text()
+    assert arbiter.insert(page) == page, "stale: run python docs/results/arbiter.py"
+    assert arbiter.insert(page.replace("|---|", "|---:|")) == page
+    assert len(page.split()) <= 1_500
+
+
+def test_every_forecaster_of_the_tables_is_in_the_plan(arbiter: ModuleType) -> None:
+    """Its rows come from the commands that the page states."""
+    commands = [command for step in arbiter.plan() for command in step.commands]
+    evaluated = {
+        Path(word).name.partition("@")[0]
+        for command in commands
+        if command.startswith("tipl evaluate")
+        for word in shlex.split(command)[2:]
+    }
+    rows = [row for file in arbiter.ROWS.glob("*.csv") for row in read_rows(file)]
+    names = {row.forecaster.partition("@")[0] for row in rows if not row.oracle}
+    assert names - evaluated <= {"persistence"}
+    for name in ("tipl-gate", arbiter.RIVAL, arbiter.SIMPLE):
+        assert name in names
+
+
+def test_the_cost_is_said_before_anything_runs(
+    arbiter: ModuleType, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["arbiter.py", "--plan"])
+    arbiter.main()
+    said = capsys.readouterr().out
+    assert said.index("CPU minutes") < said.index("tipl train gate")
