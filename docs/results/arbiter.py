@@ -29,7 +29,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from tipl.evaluation.leaderboard import Entry, Leaderboard, leaderboard
-from tipl.evaluation.results import Interval, TaskScore
+from tipl.evaluation.results import Interval, Row, TaskScore, read_results
 from tipl.evaluation.rows import TaskRow, read_rows
 from tipl.report.figures import svg
 from tipl.report.leaderboard import write_page
@@ -39,7 +39,7 @@ from weighttraj.text import between
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 PAGE = HERE.parent / "results.md"
-ROWS, COST = HERE / "rows", HERE / "cost.json"
+ROWS, COST, PAPER = HERE / "rows", HERE / "cost.json", HERE / "paper.json"
 OUT = Path("data/arbiter")
 
 LADDER = ("HalfCheetah", "Hopper", "InvertedPendulum")
@@ -72,6 +72,9 @@ SIMPLE = "last-iteration-tuned"
 """What a learned forecast has to beat in return."""
 RIVAL = "ar-20-phase"
 """What a learned forecast has to beat in weights."""
+PUBLISHED, PAPER_DATA = "tipl-inverted-pendulum-v4", "inverted-pendulum-v4-ppo-v1"
+PAPER_SPLITS = {"train": "training runs, as in the paper", "test": "test runs"}
+"""The paper names no held-out runs: TIPL is evaluated on the runs it was trained on as well."""
 RUNGS = {
     "tipl-published": "TIPL as published",
     "tipl-decayed": "+ learning rate falls, average of the weights",
@@ -95,10 +98,8 @@ class Step:
 def plan() -> list[Step]:
     """Return all commands in order."""
     everything = " ".join(TASKS)
-    gates = [
-        f"tipl train gate --without time --data {everything} --out {OUT}/all/tipl-gate@{s} --seed {s}"
-        for s in SEEDS
-    ]
+    every_task = f"tipl train gate --without time --data {everything}"
+    gates = [f"{every_task} --out {OUT}/all/tipl-gate@{s} --seed {s}" for s in SEEDS]
     gates += [
         f"tipl train gate --data {everything} --out {OUT}/all/gate-timed@0 --seed 0",
         *(
@@ -124,6 +125,15 @@ def plan() -> list[Step]:
                 _evaluation("weights", _in_weights()),
                 _evaluation("ladder", _on_ladder(), LADDER_TASKS),
                 _evaluation("returns", _in_returns()),
+            ),
+        ),
+        Step(
+            name="the paper's setting",
+            commands=tuple(
+                f"tipl evaluate {PUBLISHED} --data {PAPER_DATA} --split {split} "
+                f"--out {OUT}/paper/{split} --horizons 1 10 --starts 100 --function-starts 0 "
+                "--return-horizons 1 10 --learning-starts 2 --plateau-starts 1 --episodes 5"
+                for split in PAPER_SPLITS
             ),
         ),
     ]
@@ -223,6 +233,7 @@ def run(steps: Sequence[Step]) -> None:
                 costs[command] = round(spent, 1)
                 COST.write_text(json.dumps(costs, indent=1) + "\n")
     keep_rows()
+    keep_paper()
 
 
 def keep_rows() -> None:
@@ -309,6 +320,7 @@ def page(rows: Sequence[TaskRow]) -> dict[str, str]:
         "weights": weights_table(weights),
         "returns": returns_table(returns),
         "transfer": transfer_table(weights),
+        "paper": paper_table(),
         "ladder": ladder_table(weights),
         "commands": "\n".join(["```text", *cost_lines(plan()), "```"]),
     }
@@ -488,6 +500,45 @@ def ladder_table(board: Board) -> str:
         cells = [_cell(score and score.score, False) for score in scores]
         lines.append(f"| {told} | {count} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def paper_table() -> str:
+    """Return WPE and REPW of the released TIPL on the runs it was trained on, and on others."""
+    known = json.loads(PAPER.read_text())
+    heads = [f"{measure}, h = {h}" for measure in known["test"]["persistence"] for h in (1, 10)]
+    lines = [
+        "| evaluated on | forecaster | " + " | ".join(heads) + " |",
+        "|---|---|" + "---:|" * len(heads),
+    ]
+    for split, told in PAPER_SPLITS.items():
+        for name, measures in known[split].items():
+            cells = [f"{value:.3g}" for values in measures.values() for value in values]
+            lines.append(f"| {told} | {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def keep_paper() -> None:
+    """Copy the figures of the paper's setting into the repository."""
+    found = {}
+    for split in PAPER_SPLITS:
+        results = read_results(ROOT / OUT / "paper" / split / "results.json")
+        found[split] = {
+            name: {
+                "WPE": [_at(results.forecasters[name].wpe, h) for h in (1, 10)],
+                "REPW while learning": [
+                    _at(results.forecasters[name].repw["sampled"]["learning"], h) for h in (1, 10)
+                ],
+                "REPW after it": [
+                    _at(results.forecasters[name].repw["sampled"]["plateau"], h) for h in (1, 10)
+                ],
+            }
+            for name in ("persistence", PUBLISHED)
+        }
+    PAPER.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _at(rows: Sequence[Row], h: int) -> float | None:
+    return next(row.value for row in rows if row.h == h)
 
 
 def _shown(name: str) -> str:
