@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -143,6 +144,21 @@ class WeightTrajectoryCallback(BaseCallback):
         if self._recorder is not None:
             self._let_go()
             self._recorder.close(status)
+
+    @contextlib.contextmanager
+    def moving(self) -> Iterator[None]:
+        """Let another callback change the weights, between an update and the next rollout.
+
+        The next snapshot shows the changed weights, with the gradient steps that came after.
+        """
+        if self._recorder is None:  # this callback's turn comes after the other's
+            yield
+            return
+        self._end_update()
+        try:
+            yield
+        finally:
+            self._watch.note()
 
     def __enter__(self) -> WeightTrajectoryCallback:
         return self

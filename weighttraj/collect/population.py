@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -30,12 +31,15 @@ from weighttraj.collect.recorder import Reading
 from weighttraj.collect.rollouts import Environments, check_kernel
 from weighttraj.collect.undisturbed import undisturbed
 from weighttraj.errors import CollectError
+from weighttraj.writer import Moments
 
 _SERIAL = 15
 """Torch draws up to so many normal numbers one by one, whatever their grouping; more of them by
 another algorithm."""
 _GROUP = 2**20
 """Parameters that are updated together: 16 MB with gradients and moments, which caches hold."""
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+"""Names of Adam's moments in the optimizer's state."""
 _LOG_SQRT_2PI = np.float32(0.5 * np.log(2 * np.pi))
 
 
@@ -54,6 +58,45 @@ class Watcher(Protocol):
 
     def end_training(self, diagnostics: Mapping[str, float]) -> None:
         """The last update has ended."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Boundary:
+    """What a hook sees between an update and the next rollout."""
+
+    iteration: int
+    """Number of updates so far."""
+    num_timesteps: int
+    """Environment steps of each learner so far."""
+    progress_remaining: float
+    """Share of the environment steps that is still to come, from 1 to 0."""
+    learning_rate: float
+    """Learning rate of the update that just ended."""
+    weights: np.ndarray
+    """Policy weights, float32 (learner, param): a copy."""
+    rollout: Rollout
+    """The last rollout of all learners."""
+    returns: list[list[float]]
+    """Returns of the training episodes that ended in that rollout, for each learner."""
+
+
+Hook = Callable[[Boundary], None]
+"""A function that is called at each iteration boundary. It may move the weights with
+``Population.write`` and ``Population.restore``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerState:
+    """A copy of what one learner has learnt: see ``Population.save``."""
+
+    parameters: Tensor
+    """Row of the stack: actor and critic."""
+    moments: dict[str, Tensor]
+    """Adam's moments of the same parameters by name; empty before the first gradient step."""
+    obs_norm: Moments | None
+    """Statistics of the observations; None: there is no normaliser."""
+    ret_norm: Moments | None
+    """Statistics of the discounted rewards; None: there is no normaliser."""
 
 
 class Origin:
@@ -126,23 +169,76 @@ class Population:
             "moments": self._moments(learner) if moments else None,
         }
 
-    def train(self, watchers: Sequence[Watcher], stop: Callable[[], bool] = lambda: False) -> None:
+    @property
+    def learning_rate(self) -> float:
+        """Learning rate of the update that goes on, or of the last one."""
+        return self._learning_rate
+
+    def weights(self, learner: int) -> np.ndarray:
+        """Return a copy of a learner's policy weights, float32 (param,)."""
+        return np.asarray(self.stack.values[learner].numpy()[self._actor])
+
+    @torch.no_grad()
+    def write(self, learner: int, weights: np.ndarray) -> None:
+        """Replace a learner's policy weights, float32 (param,); all else stays as it is."""
+        self.stack.values[learner].numpy()[self._actor] = weights
+
+    def forget_direction(self, learner: int) -> None:
+        """Set Adam's first moment of a learner's policy weights to 0."""
+        part, learners = self._group(learner)
+        learners.moments("exp_avg")[learner - part.start].numpy()[self._actor] = 0
+
+    def save(self, learner: int) -> LearnerState:
+        """Return a copy of a learner's policy, critic, Adam's moments and normalisers."""
+        part, learners = self._group(learner)
+        normalizer = self._environments.normalizer
+        return LearnerState(
+            parameters=self.stack.values[learner].clone(),
+            moments={n: learners.moments(n)[learner - part.start].clone() for n in _MOMENTS},
+            obs_norm=normalizer.obs_norm(learner),
+            ret_norm=normalizer.ret_norm(learner),
+        )
+
+    @torch.no_grad()
+    def restore(self, learner: int, state: LearnerState) -> None:
+        """Put a learner back to what ``save`` returned. Its environment goes on where it is.
+
+        The numbers of Adam's steps and of observed rewards are the same for all learners, and stay.
+        """
+        part, learners = self._group(learner)
+        self.stack.values[learner] = state.parameters
+        for name, moments in state.moments.items():
+            learners.moments(name)[learner - part.start] = moments
+        self._environments.normalizer.restore(learner, state.obs_norm, state.ret_norm)
+
+    def train(
+        self,
+        watchers: Sequence[Watcher],
+        stop: Callable[[], bool] = lambda: False,
+        hook: Hook | None = None,
+    ) -> None:
         """Train to the end.
 
         Args:
             watchers: who follows the first learners; the others are not followed.
             stop: asked before each rollout; True ends the training there.
+            hook: called after each update; None: training is the same, bit by bit, as with a hook
+                that changes nothing.
         """
         total = self._config.n_iterations * self._config.n_steps
         while self.num_timesteps < total and not stop():
-            self._iterate(watchers, total)
+            for ended in self._environments.ended:
+                ended.clear()
+            rollout = self._iterate(watchers, total)
+            if hook is not None:
+                hook(self._boundary(rollout, total))
 
     def close(self) -> None:
         """Close the environments."""
         self._environments.close()
 
     @torch.no_grad()
-    def _iterate(self, watchers: Sequence[Watcher], total: int) -> None:
+    def _iterate(self, watchers: Sequence[Watcher], total: int) -> Rollout:
         rollout = self._roll_out()
         self.num_timesteps += self._config.n_steps
         for watcher, returns, inputs in zip(
@@ -159,6 +255,18 @@ class Population:
             for watcher, figures in zip(some, diagnostics, strict=False):
                 last = self.num_timesteps >= total
                 (watcher.end_training if last else watcher.end_update)(figures)
+        return rollout
+
+    def _boundary(self, rollout: Rollout, total: int) -> Boundary:
+        return Boundary(
+            iteration=self.num_timesteps // self._config.n_steps,
+            num_timesteps=self.num_timesteps,
+            progress_remaining=1.0 - self.num_timesteps / total,
+            learning_rate=self._learning_rate,
+            weights=self.stack.values.numpy()[:, self._actor],
+            rollout=rollout,
+            returns=[list(ended) for ended in self._environments.ended],
+        )
 
     def _roll_out(self) -> Rollout:
         """Let every learner act for a rollout; then judge what it saw, in one go."""
@@ -220,12 +328,15 @@ class Population:
         return np.array(orders).swapaxes(0, 1)
 
     def _moments(self, learner: int) -> tuple[np.ndarray, np.ndarray]:
-        part, learners = next(pair for pair in self.groups if learner < pair[0].stop)
+        part, learners = self._group(learner)
         first, second = (
-            learners.moments(name)[learner - part.start].numpy()[self._actor]
-            for name in ("exp_avg", "exp_avg_sq")
+            learners.moments(name)[learner - part.start].numpy()[self._actor] for name in _MOMENTS
         )
         return first, second
+
+    def _group(self, learner: int) -> tuple[slice, Learners]:
+        """Return the learners that are updated together with one of them."""
+        return next(pair for pair in self.groups if learner < pair[0].stop)
 
 
 def origins_of(config: PPOConfig, seeds: Sequence[int]) -> list[Origin]:

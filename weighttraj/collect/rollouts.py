@@ -51,6 +51,8 @@ class Environments:
         """Whether the episode before was cut off at the time limit, and not terminated."""
         self.returns: list[deque[Any]] = [deque(maxlen=_EPISODES) for _ in seeds]
         """Returns of each learner's last episodes."""
+        self.ended: list[list[float]] = [[] for _ in seeds]
+        """Returns of the episodes that ended since a reader last cleared the list."""
         self._return = np.zeros(len(seeds), self.normalizer.returns_dtype)
         self._length = np.zeros(len(seeds), np.int64)
 
@@ -95,6 +97,7 @@ class Environments:
         """Begin the next episode of some learners; observations, float64 (learner, obs)."""
         for learner in learners:
             self.returns[learner].append(self._return[learner])
+            self.ended[learner].append(float(self._return[learner]))
         self._return[learners], self._length[learners] = 0, 0
         return self._reset(learners, [None] * len(learners))
 

@@ -54,6 +54,10 @@ class ObservationStatistics:
         mean, var = self.mean[learner].copy(), self.var[learner].copy()
         return mean, var, float(self.count[learner].item())
 
+    def restore(self, learner: int, statistics: Moments) -> None:
+        """Put one learner's statistics back to what ``of`` returned."""
+        self.mean[learner], self.var[learner], self.count[learner] = statistics
+
 
 class RewardStatistics:
     """Variance of each learner's discounted rewards, and rewards scaled with it.
@@ -86,6 +90,10 @@ class RewardStatistics:
         """Return a copy of one learner's statistics."""
         mean, var = (np.array(x[learner]) for x in (self.mean, self.var))
         return mean, var, float(self.count)
+
+    def restore(self, learner: int, statistics: Moments) -> None:
+        """Put one learner's mean and variance back; the count is the same for all, and stays."""
+        self.mean[learner], self.var[learner], _ = statistics
 
 
 class Normalizer(Protocol):
@@ -126,6 +134,9 @@ class Normalizer(Protocol):
     def ret_norm(self, learner: int) -> Moments | None:
         """Return a copy of the statistics of a learner's discounted rewards, if there are any."""
 
+    def restore(self, learner: int, obs_norm: Moments | None, ret_norm: Moments | None) -> None:
+        """Put a learner's statistics back to what ``obs_norm`` and ``ret_norm`` returned."""
+
 
 class NoNormalizer:
     """Observations and rewards as the environment gives them. See ``Normalizer``."""
@@ -154,6 +165,9 @@ class NoNormalizer:
         """See ``Normalizer``."""
         return None
 
+    def restore(self, learner: int, obs_norm: Moments | None, ret_norm: Moments | None) -> None:
+        """See ``Normalizer``."""
+
 
 class _RunningNormalizer:
     """What Gymnasium's and SB3's normalisers have in common."""
@@ -174,6 +188,12 @@ class _RunningNormalizer:
     def ret_norm(self, learner: int) -> Moments | None:
         """See ``Normalizer``."""
         return self._rewards.of(learner)
+
+    def restore(self, learner: int, obs_norm: Moments | None, ret_norm: Moments | None) -> None:
+        """See ``Normalizer``."""
+        if obs_norm is not None and ret_norm is not None:
+            self._observations.restore(learner, obs_norm)
+            self._rewards.restore(learner, ret_norm)
 
 
 class GymnasiumNormalizer(_RunningNormalizer):
