@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from tipl.errors import LeftOutWarning
+from tipl.growing import GrowingRun
 from weighttraj import Run
 from weighttraj.load import CachedWeights
 
@@ -49,11 +50,16 @@ class Rows(Protocol):
 
 
 def while_open(function: Callable[Concatenate[Run, P], T]) -> Callable[Concatenate[Run, P], T]:
-    """Keep what a function of a run returns as long as the run is open, for each argument."""
+    """Keep what a function of a run returns as long as the run is open, for each argument.
+
+    Of a run that grows in memory nothing is kept: it is another run after each snapshot.
+    """
     known: WeakKeyDictionary[Run, dict[Any, T]] = WeakKeyDictionary()
 
     @functools.wraps(function)
     def kept(run: Run, /, *args: P.args, **options: P.kwargs) -> T:
+        if isinstance(run, GrowingRun):
+            return function(run, *args, **options)
         results, key = known.setdefault(run, {}), (args, *sorted(options.items()))
         if key not in results:
             results[key] = function(run, *args, **options)
@@ -67,12 +73,14 @@ def weights_of(run: Run) -> Float32[np.ndarray, "time param"]:
     """Return the weights of a run: a read-only memory map, decoded when it is first needed.
 
     The snapshots of a run that is still being collected are read into memory instead: each state
-    of a growing run would be another file in the cache.
+    of a growing run would be another file in the cache. A run that grows in memory gives a view.
 
     Raises:
         CacheError: the cache's folder cannot be used.
         DamageError: the run is damaged.
     """
+    if isinstance(run, GrowingRun):
+        return run.rows
     if run.info.status == "complete":
         return CachedWeights(run).map()
     return np.asarray(run.weights[:], np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,24 +34,7 @@ class Structure:
     @classmethod
     def of(cls, layout: ParamLayout) -> Structure:
         """Return the structure of a policy's layout."""
-        size = layout.size
-        tensor, row, column = (np.zeros(size, np.int64) for _ in range(3))
-        rows = columns = 0
-        for number, param in enumerate(layout.params):
-            tensor[param.slice] = number
-            shape = param.shape if len(param.shape) == 2 else (param.size, 1)
-            i, j = (place.ravel() for place in np.indices(shape))
-            is_matrix = len(param.shape) == 2
-            row[param.slice] = rows + i
-            column[param.slice] = columns + (j if is_matrix else i)
-            rows, columns = rows + shape[0], columns + (shape[1] if is_matrix else shape[0])
-        return cls(
-            tensor=torch.from_numpy(tensor),
-            row=torch.from_numpy(row),
-            column=torch.from_numpy(column),
-            kind=torch.tensor([_kind(param.role, param.axes) for param in layout.params]),
-            slices=tuple(param.slice for param in layout.params),
-        )
+        return _structure(layout)
 
     def means(self, values: Float[Tensor, "any param"]) -> Float[Tensor, "any tensor"]:
         """Return means over the parameters of each tensor."""
@@ -78,6 +62,29 @@ class Clock:
         """Return the time of a snapshot as networks see it: its index, its learning rate twice."""
         rate = float(self.rate[t])
         return np.log1p(t) / 4, rate, np.log(rate + 1e-3) / 3
+
+
+@functools.lru_cache(maxsize=8)
+def _structure(layout: ParamLayout) -> Structure:
+    """Return the structure of a layout; a training asks for the same one again and again."""
+    size = layout.size
+    tensor, row, column = (np.zeros(size, np.int64) for _ in range(3))
+    rows = columns = 0
+    for number, param in enumerate(layout.params):
+        tensor[param.slice] = number
+        shape = param.shape if len(param.shape) == 2 else (param.size, 1)
+        i, j = (place.ravel() for place in np.indices(shape))
+        is_matrix = len(param.shape) == 2
+        row[param.slice] = rows + i
+        column[param.slice] = columns + (j if is_matrix else i)
+        rows, columns = rows + shape[0], columns + (shape[1] if is_matrix else shape[0])
+    return Structure(
+        tensor=torch.from_numpy(tensor),
+        row=torch.from_numpy(row),
+        column=torch.from_numpy(column),
+        kind=torch.tensor([_kind(param.role, param.axes) for param in layout.params]),
+        slices=tuple(param.slice for param in layout.params),
+    )
 
 
 def _kind(role: str, axes: tuple[str, ...]) -> int:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from tipl.runs import weights_of, while_open
+from tipl.runs import weights_of
 from weighttraj import Run
 
 SQUARES_BETA = 0.95
@@ -89,7 +90,7 @@ def histories(
     The history is valid until the next one. It always begins at phi_0, so a forecast does not
     depend on earlier calls; a call with later starts than the last one of this run goes on there.
     """
-    walks, key, weights = _walks(run), (lags, tuple(betas)), weights_of(run)
+    walks, key, weights = _WALKS.setdefault(run, {}), (lags, tuple(betas)), weights_of(run)
     history = walks.pop(key, None)
     if history is None or history.t > min(starts):
         history = History(weights[0], lags, betas)
@@ -100,7 +101,5 @@ def histories(
     walks[key] = history
 
 
-@while_open
-def _walks(run: Run) -> dict[tuple[int, tuple[float, ...]], History]:
-    """Return the histories where walks along a run ended; none at first."""
-    return {}
+_WALKS: WeakKeyDictionary[Run, dict[tuple[int, tuple[float, ...]], History]] = WeakKeyDictionary()
+"""Histories where walks along a run ended. A run that grows is followed from there."""
