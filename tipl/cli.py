@@ -58,6 +58,11 @@ COMMANDS = {
         "Write the page and figures of a result file again.",
         "tipl.commands.evaluate:report",
     ),
+    "live": Command(
+        "Use",
+        "Jump ahead inside PPO trainings: run the arms of a study, and compare them.",
+        "tipl.commands.live:live",
+    ),
     "release": Command("Publish", "Put a model into the zoo.", "tipl.commands.publish:release"),
     "card": Command("Publish", "Write the card of a released model.", "tipl.commands.publish:card"),
     "push": Command(

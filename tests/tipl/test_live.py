@@ -14,11 +14,17 @@ from stable_baselines3 import PPO
 
 import tipl
 import weighttraj as wt
+from tests.pages import ROOT, run_command
 from tests.small import CONFIGS, SMALL, learn, random_states
-from tipl.errors import ForecastError
+from tipl.errors import EvaluateError, ForecastError
 from tipl.forecaster import Forecaster
+from tipl.growing import GrowingRun
 from tipl.live import ForecastCallback, IterationAverage, Jump, JumpConfig, PopulationJumps
 from tipl.live.guards import ReturnWatch, passes_batch
+from tipl.live.plan import ppo_of, read_plan
+from tipl.live.results import Cpu, Curve, Series, read_live
+from tipl.live.study import LiveConfig, run_live
+from tipl.live.summary import compare, mean_log_ratio, steps_to, thresholds_of
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.collect.agents import find_agent
 from weighttraj.collect.describe import describe_run
@@ -285,3 +291,179 @@ def test_the_batch_guard_of_a_population_refuses_a_long_jump() -> None:
     guarded, jumps = trained(SMALL, [3, 4], replace(OUTER, guard="batch"), 3.0)
     assert [jump.outcome for jump in jumps.jumps[0]] == ["refused"] * 3
     np.testing.assert_array_equal(plain, guarded)
+
+
+# ``tipl live``
+
+PLAN = """
+id = "small"
+rival = "outer"
+population = 2
+bootstrap = 50
+seeds = { tuning = "10:12", test = "20:23" }
+evaluation = { every = 1, episodes = 2, smooth = 1 }
+tasks.pendulum = { recipe = "recipe.toml", total_timesteps = 256 }
+[arms.ppo]
+[arms.outer]
+forecaster = "last-iteration"
+jump = { horizon = 4, first = 1, every = 2 }
+grid = { amplitude = [1.0, 2.0] }
+[arms.far]
+forecaster = "last-iteration"
+jump = { horizon = 50, every = 2, guard = "batch" }
+"""
+SHORT = """
+id = "pendulum"
+[ppo]
+n_steps = 64
+batch_size = 16
+n_epochs = 2
+critic_arch = [8, 8]
+[seeds]
+train = "0:2"
+[store]
+every = 2
+"""
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Path:
+    (tmp_path / "recipe.toml").write_text(SHORT)
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return tmp_path / "plan.toml"
+
+
+def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
+    plan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(plan.parent)
+    untuned = LiveConfig(plan=plan, out=plan.parent / "out")
+    with pytest.raises(EvaluateError, match="--stage tuning"):
+        run_live(untuned)
+    run_command("tipl live plan.toml --out out --stage tuning")
+    tuned = read_live(plan.parent / "out/tuning/results.json")
+    assert len(tuned.series) == 4
+    assert tuned.best["pendulum"]["outer"] in ("outer:amplitude=1.0", "outer:amplitude=2.0")
+    run_command("tipl live plan.toml --out out --stage test")
+    results = read_live(plan.parent / "out/test/results.json")
+    assert {one.arm: len(one.curves) for one in results.series} == {"ppo": 3, "outer": 3, "far": 3}
+    assert results.series[0].num_timesteps == [0, 64, 128, 192, 256]
+    assert {(f.arm, f.against) for f in results.figures} == {
+        *(("outer", "ppo"), ("far", "ppo")),
+        *(("ppo", "outer"), ("far", "outer")),
+    }
+    lines = (plan.parent / "out/test/curves.csv").read_text().splitlines()
+    assert len(lines) == 1 + 3 * 3 * 5
+    files = {file: file.stat().st_mtime_ns for file in plan.parent.rglob("2*.json")}
+    assert len(files) == 3 * 2  # seeds 20 and 21, and 22 alone
+    lost, *_ = files
+    before = lost.read_bytes()
+    lost.unlink()
+    again = run_live(untuned)
+    assert json.loads(lost.read_bytes())["curves"] == json.loads(before)["curves"]
+    assert again.figures == results.figures
+    assert {f: f.stat().st_mtime_ns for f in files if f != lost} == {
+        file: time for file, time in files.items() if file != lost
+    }
+    page = plan.parent / "page.md"
+    page.write_text("<!-- live of out/test/results.json -->\n<!-- end of live -->\n")
+    run_command("tipl report out/test/results.json --into page.md")
+    assert page.read_text().count("\n| ") == 2 + 4
+    assert (plan.parent / "results/pendulum.svg").read_text().startswith("\n<!DOCTYPE svg")
+
+
+@pytest.mark.long
+def test_processes_make_the_same_curves(plan: Path) -> None:
+    stage = {"plan": plan, "stage": "tuning"}
+    one = run_live(LiveConfig(**stage, out=plan.parent / "one"))  # type: ignore[arg-type]
+    two = run_live(LiveConfig(**stage, out=plan.parent / "two", workers=2))  # type: ignore[arg-type]
+    assert [x.curves for x in one.series] == [x.curves for x in two.series]
+
+
+def test_a_bad_jump_is_undone_after_the_last_iteration_too() -> None:
+    before: dict[str, np.ndarray] = {}
+
+    class Bad(ForecastCallback):
+        def _on_rollout_start(self) -> None:
+            before.update(parameters(self.model))
+            super()._on_rollout_start()
+            self._watch.add([1000.0, 1001.0])
+
+    config = replace(SMALL, total_timesteps=128)
+    callback = Bad(Ahead(3.0), replace(OUTER, guard="rollout", episodes=2))
+    model = learn(config, callback)
+    assert [jump.outcome for jump in callback.jumps] == ["undone"]
+    for name, values in parameters(model).items():
+        np.testing.assert_array_equal(before[name], values)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('rival = "outer"', 'rival = "none"', "no arm 'none'"),
+        ('"20:23"', '"11:23"', "for tuning and for the test"),
+        ("horizon = 4", "horison = 4", "no settings"),
+        ("horizon = 4", "horizon = 0", "horizon of at least 1"),
+        ("population = 2", "popolation = 2", "popolation"),
+    ],
+)
+def test_an_invalid_plan_is_refused(plan: Path, old: str, new: str, told: str) -> None:
+    plan.write_text(PLAN.replace(old, new))
+    with pytest.raises(EvaluateError, match=told):
+        read_plan(plan)
+
+
+def test_the_published_plan_can_be_read() -> None:
+    plan = read_plan(ROOT / "docs/studies/live.toml")
+    for task in plan.tasks:
+        trials = plan.trials(task)
+        assert {len(some) for name, some in trials.items() if name != "ppo"} == {6}
+        ppo, every = ppo_of(plan, task, ROOT / "docs/studies")
+        assert ppo.gradient_steps_per_iteration // every == 5
+
+
+def line(arm: str, *runs: list[float]) -> Series:
+    """Trainings that were evaluated after 0, 100, 200, ... steps."""
+    return Series(
+        task="pendulum",
+        arm=arm,
+        trial=arm,
+        settings={},
+        num_timesteps=[100 * i for i in range(len(runs[0]))],
+        curves=[Curve(seed=i, returns=list(run)) for i, run in enumerate(runs)],
+        cpu=Cpu(training=1, forecasts=0, evaluation=0),
+    )
+
+
+def test_steps_to_a_return_are_interpolated_paired_and_censored(plan: Path) -> None:
+    study = read_plan(plan)
+    slow, fast = [0.0, 10, 20, 30, 40], [0.0, 20, 40, 40, 40]
+    mine, others = line("far", fast, fast, [0.0] * 5), line("ppo", slow, slow, slow)
+    evaluation = study.evaluation_of("pendulum")
+    limits = thresholds_of(study, others)
+    assert limits == pytest.approx({"50": 20, "75": 30, "90": 36, "95": 38})
+    steps, censored = steps_to(mine, limits["75"], evaluation)
+    np.testing.assert_allclose(steps, [150, 150, 400])
+    assert censored == 1
+    found = {figure.name: figure for figure in compare(study, mine, others, limits)}
+    ratio = found["steps to 75 %"]
+    assert ratio.value == pytest.approx((0.5 * 0.5 * 4 / 3) ** (1 / 3))
+    assert (ratio.censored, ratio.censored_against) == (1, 0)
+    assert found["worst decile"].value == pytest.approx(-1)
+    assert mean_log_ratio(study, line("far", fast), line("ppo", slow), limits) < 0
+
+
+def test_an_average_of_iterations_follows_whole_iterations() -> None:
+    run = GrowingRun(run_info())
+    size = run.layout.size
+    place = np.zeros(size, np.float32)
+    for t in range(13):  # iterations of 4 snapshots with steps 1, 2 and 4
+        place = place + np.float32(0 if t == 0 else 2 ** ((t - 1) // 4))
+        index = {"num_timesteps": t, "iteration": 0, "gradient_step": t, "learning_rate": 1}
+        run.append(place, phase=(t - 1) % 4 if t else -1, **index)
+    last, average = (
+        IterationAverage(beta).forecast(run, [12], [4, 8])[0, :, 0] - place[0]
+        for beta in (0.0, 0.5)
+    )
+    assert last.tolist() == [16, 32]
+    np.testing.assert_allclose(average, np.array([4, 8]) * (4 + 2 / 2 + 1 / 4) / 1.75)

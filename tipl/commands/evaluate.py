@@ -14,9 +14,11 @@ from rich.table import Table
 
 import weighttraj as wt
 from tipl.checks.model import check_model
+from tipl.commands.live import live_report
 from tipl.evaluation.config import EvaluateConfig
 from tipl.evaluation.results import Results, read_results, write_document
 from tipl.evaluation.rows import trained_on
+from tipl.live.results import is_live
 from tipl.registry import folder_of, load
 from tipl.report import tables
 from tipl.report.markdown import insert_markdown
@@ -138,7 +140,13 @@ def report(
         Path | None, tyro.conf.arg(help="rewrite the places of these results in a Markdown page")
     ] = None,
 ) -> None:
-    """Write the page and figures of a result file again, or its places in a Markdown page."""
+    """Write the page and figures of a result file again, or its places in a Markdown page.
+
+    Of the results of ``tipl live`` there is no page: they go into Markdown only.
+    """
+    if is_live(here(results)):
+        live_report(results, into)
+        return
     document = read_results(here(results))
     if into is not None:
         insert_markdown(document, results, into)

@@ -112,6 +112,8 @@ class ForecastCallback(BaseCallback):
                 -self.model.n_steps * self.model.n_envs // self.model.batch_size
             )
             self._path = TrainingPath(self._forecaster, self.config, layout, self._weights(), steps)
+        if self._hook is not None:  # an exception ended the call of learn() before
+            self._hook.remove()
         optimizer = cast(torch.optim.Optimizer, self._agent.optimizer)
         self._hook = optimizer.register_step_post_hook(self._on_gradient_step)
         self._trained = False
@@ -276,8 +278,11 @@ class ForecastCallback(BaseCallback):
                 stack.enter_context(recorder.moving())
             yield
 
+    @torch.no_grad()
     def _on_training_end(self) -> None:
         self._hook.remove()
+        if self._before is not None and self._fallen:
+            self._undo(self._weights(), self._before)
         paths = [_beside(recorder.path) for recorder in _recorders(self.locals.get("callback"))]
         for path in [self._log] if self._log is not None else paths:
             content = msgspec.json.encode([asdict(jump) for jump in self.jumps])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from tipl.errors import ForecastError
@@ -55,9 +55,9 @@ class JumpConfig:
 
     def __post_init__(self) -> None:
         least = {"horizon": 1, "period": 1, "first": 1, "max_kl": 0, "noise": 0, "episodes": 2}
-        check_settings(vars(self), least, ForecastError)
+        check_settings(asdict(self), least, ForecastError)
         if self.every is not None:
-            check_settings(vars(self), {"every": 1}, ForecastError)
+            check_settings({"every": self.every}, {"every": 1}, ForecastError)
         pairs = () if isinstance(self.schedule, str) else self.schedule
         if not isinstance(self.schedule, str) and not pairs:
             raise _no_schedule(self.schedule)

@@ -45,12 +45,18 @@ def forecaster_of(forecaster: str | Path | Forecaster) -> Forecaster:
     return forecaster
 
 
-def every_of(forecaster: Forecaster, config: JumpConfig) -> int:
-    """Return the number of gradient steps between two snapshots of the path."""
+def every_of(forecaster: Forecaster, config: JumpConfig, default: int = EVERY) -> int:
+    """Return the number of gradient steps between two snapshots of the path.
+
+    Args:
+        forecaster: fitted ones know the cadence of their training runs.
+        config: its ``every`` comes first.
+        default: of forecasters of any cadence.
+    """
     trained = getattr(getattr(forecaster, "config", None), "every", None)
     if trained is None:
         trained = getattr(getattr(getattr(forecaster, "gate", None), "config", None), "every", None)
-    return config.every or trained or EVERY
+    return config.every or trained or default
 
 
 class TrainingPath:
@@ -62,6 +68,7 @@ class TrainingPath:
         layout: order of the parameters.
         weights: policy weights before training.
         gradient_steps: number of gradient steps of one iteration; None: it varies.
+        every: number of gradient steps between snapshots for forecasters of any cadence.
     """
 
     def __init__(
@@ -71,13 +78,14 @@ class TrainingPath:
         layout: ParamLayout,
         weights: Float32[np.ndarray, " param"],
         gradient_steps: int | None,
+        every: int = EVERY,
     ) -> None:
         self.jumps: list[Jump] = []
         """What was done so far."""
         self.seconds = 0.0
         """CPU time of forecasts and of keeping the path."""
         self._forecaster, self._config = forecaster, config
-        self._every = every_of(forecaster, config)
+        self._every = every_of(forecaster, config, every)
         self._known = known_horizons(forecaster)
         cadence = Cadence(every=self._every, gradient_steps_per_iteration=gradient_steps)
         self._run = GrowingRun(RunInfo(run_id="live", layout=layout, cadence=cadence))

@@ -12,9 +12,10 @@ from jaxtyping import Float32
 from tipl.forecaster import Forecaster
 from tipl.live.config import Jump, JumpConfig
 from tipl.live.guards import ReturnWatch, passes_batch, surrogate
-from tipl.live.path import TrainingPath
+from tipl.live.path import EVERY, TrainingPath
 from weighttraj import RunInfo
 from weighttraj.collect.population import Boundary, LearnerState, Population
+from weighttraj.format.schema import Cadence
 from weighttraj.policies import Policy
 
 
@@ -87,9 +88,12 @@ class _Learner:
         self._watch = ReturnWatch(config)
         self._before: tuple[Jump, LearnerState] | None = None
         self._iteration = 0
-        steps = info.cadence.gradient_steps_per_iteration if info.cadence else None
+        cadence = info.cadence or Cadence(every=EVERY)
+        steps = cadence.gradient_steps_per_iteration
         weights = population.weights(learner)
-        self.path = TrainingPath(forecaster, config, info.layout, weights, steps)
+        self.path = TrainingPath(
+            forecaster, config, info.layout, weights, steps, every=cadence.every
+        )
 
     def end_rollout(self, returns: Sequence[Any], inputs: np.ndarray) -> None:
         """See ``Recorder``."""

@@ -1,0 +1,64 @@
+"""``tipl live``, and ``tipl report`` of its results."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.markup import escape
+from rich.table import Table
+
+from tipl.live.results import LiveResults, read_live
+from tipl.live.study import LiveConfig, run_live
+from tipl.report.live import COLUMNS, cells, insert_live, rows_of, write_figures
+from weighttraj.remote.address import here, new_path
+from weighttraj.terminal import Output, say
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveCommand(LiveConfig):
+    """Run one stage of a study: its arms on its tasks with its seeds, and compare them.
+
+    Each population of seeds is a file; with the same command a study goes on where it stopped.
+    """
+
+    plan: tyro.conf.Positional[Path]
+    """The plan, a TOML file: see docs/live.md."""
+
+
+def live(args: LiveCommand) -> None:
+    """Run one stage of a study: its arms on its tasks with its seeds, and compare them."""
+    new_path(args.out)
+    console = Output()
+    command = shlex.join(["tipl", *sys.argv[1:]])
+    results = run_live(args, command=command, console=console)
+    folder = args.out / args.stage
+    write_figures(results, folder)
+    for task in results.thresholds:
+        console.print(_table(results, task))
+    say(f"results: {folder / 'results.json'}")
+
+
+def live_report(results: Path, into: Path | None) -> None:
+    """Draw the figures of a study again, or write its places in a Markdown page."""
+    document = read_live(here(results))
+    if into is None:
+        write_figures(document, results.parent)
+        say(f"figures in {results.parent}")
+    else:
+        insert_live(document, results, into)
+        say(f"results in {into}")
+
+
+def _table(results: LiveResults, task: str) -> Table:
+    table = Table(title=f"{task}, {results.stage} seeds, against {results.baseline}")
+    table.add_column("arm", no_wrap=True)
+    for column in COLUMNS:
+        table.add_column(column, justify="right")
+    for arm in rows_of(results, task, results.baseline):
+        texts = cells(results, task, arm, results.baseline, interval=False)
+        table.add_row(escape(arm), *texts)
+    return table

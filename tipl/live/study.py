@@ -1,0 +1,221 @@
+"""Runs a study: every arm on every task with every seed, on again where it was stopped."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+from tipl.errors import EvaluateError
+from tipl.live.block import Block, Made, make_block, read_block
+from tipl.live.plan import Plan, Stage, Trial, ppo_of, read_plan, settings_of
+from tipl.live.results import Cpu, Figure, LiveResults, Series, read_live, write_json
+from tipl.live.summary import compare, final, mean_log_ratio, thresholds_of
+from weighttraj.atomic import replace_file
+from weighttraj.engine import engine_of
+from weighttraj.progress import LoggedProgress
+
+RESULTS = "results.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveConfig:
+    """One stage of a study."""
+
+    plan: Path
+    """The plan, a TOML file."""
+    out: Path
+    """Folder of results; each stage has a folder of its own in it."""
+    stage: Stage = "test"
+    """``tuning``: all points of the grids on the tuning seeds; ``test``: of each arm the best point
+    on the test seeds."""
+    tasks: tuple[str, ...] = ()
+    """Tasks to run; empty: all of the plan."""
+    arms: tuple[str, ...] = ()
+    """Arms to run; empty: all of the plan. The baseline always runs."""
+    seeds: int | None = None
+    """Number of seeds, the first ones; unset: all of the stage."""
+    workers: int = 1
+    """Number of processes; each takes a population of seeds at a time."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler whose workers do it instead, or ``local``."""
+
+
+def run_live(
+    config: LiveConfig, *, command: str = "", console: Console | None = None
+) -> LiveResults:
+    """Train what is missing, and write ``results.json`` and ``curves.csv``.
+
+    Each population of seeds is a file; those that are there and have the same settings are left
+    alone. So a study that was stopped goes on with the same command.
+
+    Raises:
+        EvaluateError: the plan is invalid, or the stage ``test`` comes before the tuning.
+        KeyboardInterrupt: it was stopped; finished populations are kept.
+    """
+    plan = read_plan(config.plan)
+    blocks = list(_blocks(plan, config))
+    _make([block for block in blocks if read_block(block) is None], config, console)
+    series = _series(blocks)
+    results = _results(plan, config, series, command)
+    folder = config.out / config.stage
+    write_json(folder / RESULTS, results)
+    replace_file(folder / "curves.csv", _csv(series).encode())
+    return results
+
+
+def _blocks(plan: Plan, config: LiveConfig) -> Iterator[Block]:
+    """Yield the populations of a stage."""
+    for name in (*config.tasks, *config.arms):
+        if name not in plan.tasks and name not in plan.arms:
+            raise EvaluateError(
+                "the plan has no such task or arm",
+                expected=", ".join((*plan.tasks, *plan.arms)),
+                got=name,
+                where=config.plan,
+                do="name tasks with --tasks and arms with --arms",
+            )
+    seeds = plan.seeds_of(config.stage)[: config.seeds]
+    groups = [seeds[i : i + plan.population] for i in range(0, len(seeds), plan.population)]
+    for task in config.tasks or plan.tasks:
+        ppo, every = ppo_of(plan, task, config.plan.parent)
+        for trial in _trials(plan, config, task):
+            for group in groups:
+                name = f"{group[0]}-{group[-1]}.json"
+                yield Block(
+                    file=config.out / config.stage / task / trial.name / name,
+                    task=task,
+                    trial=trial,
+                    config=ppo,
+                    every=every,
+                    evaluation=plan.evaluation_of(task),
+                    seeds=group,
+                )
+
+
+def _trials(plan: Plan, config: LiveConfig, task: str) -> Iterator[Trial]:
+    """Yield the trials of a stage on a task: all of them, or the best of each arm."""
+    for arm, trials in plan.trials(task).items():
+        if config.arms and arm not in (*config.arms, plan.baseline):
+            continue
+        if config.stage == "tuning" or len(trials) == 1:
+            yield from trials
+        else:
+            best = _tuned(config, task, arm)
+            yield next((t for t in trials if t.name == best), trials[0])
+
+
+def _tuned(config: LiveConfig, task: str, arm: str) -> str:
+    """Return the name of the arm's best trial on the tuning seeds."""
+    file = config.out / "tuning" / RESULTS
+    found = read_live(file).best.get(task, {}).get(arm) if file.exists() else None
+    if found is None:
+        raise EvaluateError(
+            "the arm has a grid, and was not tuned",
+            expected=f"results of the tuning seeds in {file}",
+            got=f"none of arm {arm!r} on task {task!r}",
+            do=f"run: tipl live {config.plan} --out {config.out} --stage tuning",
+        )
+    return found
+
+
+def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) -> None:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with (
+        engine_of(config.workers, config.scheduler) as engine,
+        LoggedProgress(*columns, console=console) as progress,
+    ):
+        total = sum(block.config.n_iterations for block in blocks)
+        bar = progress.add_task(f"{len(blocks)} populations", total=total)
+        for block, outcome in engine.run(
+            make_block, blocks, lambda count: progress.advance(bar, count), wait=False
+        ):
+            if isinstance(outcome, Exception):
+                outcome.add_note(f"arm {block.trial.name}, task {block.task}")
+                raise outcome
+
+
+def _series(blocks: Sequence[Block]) -> list[Series]:
+    """Return the trainings of each trial on each task."""
+    found: dict[tuple[str, str], list[tuple[Block, Made]]] = {}
+    for block in blocks:
+        if (made := read_block(block)) is not None:
+            found.setdefault((block.task, block.trial.name), []).append((block, made))
+    return [_joined(pairs) for pairs in found.values()]
+
+
+def _joined(pairs: Sequence[tuple[Block, Made]]) -> Series:
+    (block, first), *_ = pairs
+    made = [one for _, one in pairs]
+    names = ("training", "forecasts", "evaluation")
+    return Series(
+        task=block.task,
+        arm=block.trial.arm,
+        trial=block.trial.name,
+        settings=settings_of(block.trial),
+        num_timesteps=first.num_timesteps,
+        curves=[curve for one in made for curve in one.curves],
+        cpu=Cpu(**{name: sum(getattr(one.cpu, name) for one in made) for name in names}),
+    )
+
+
+def _results(plan: Plan, config: LiveConfig, series: Sequence[Series], command: str) -> LiveResults:
+    thresholds: dict[str, dict[str, float]] = {}
+    finals: dict[str, dict[str, float]] = {}
+    best: dict[str, dict[str, str]] = {}
+    figures: list[Figure] = []
+    for task in dict.fromkeys(one.task for one in series):
+        mine = [one for one in series if one.task == task]
+        (baseline,) = (one for one in mine if one.arm == plan.baseline)
+        limits = thresholds[task] = thresholds_of(plan, baseline)
+        finals[task] = {one.trial: final(one, plan.evaluation_of(task)) for one in mine}
+        scores = {one.trial: mean_log_ratio(plan, one, baseline, limits) for one in mine}
+        best[task] = {
+            arm: min((one.trial for one in mine if one.arm == arm), key=scores.__getitem__)
+            for arm in dict.fromkeys(one.arm for one in mine)
+        }
+        chosen = [one for one in mine if best[task][one.arm] == one.trial]
+        rivals = [one for one in chosen if one.arm in (plan.baseline, plan.rival)]
+        for other in rivals:
+            for one in chosen:
+                if one.arm != other.arm:
+                    figures += compare(plan, one, other, limits)
+    builtins: dict[str, Any] = msgspec.to_builtins(plan)
+    return LiveResults(
+        study=plan.id,
+        stage=config.stage,
+        baseline=plan.baseline,
+        rival=plan.rival,
+        plan=builtins,
+        thresholds=thresholds,
+        final=finals,
+        best=best,
+        series=list(series),
+        figures=figures,
+        command=command,
+    )
+
+
+def _csv(series: Sequence[Series]) -> str:
+    """Return one line for each evaluation of each training."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["task", "arm", "trial", "seed", "num_timesteps", "return"])
+    for one in series:
+        for curve in one.curves:
+            for steps, value in zip(one.num_timesteps, curve.returns, strict=True):
+                told = "" if value is None else f"{value:.6g}"
+                writer.writerow([one.task, one.arm, one.trial, curve.seed, steps, told])
+    return text.getvalue()
