@@ -19,6 +19,7 @@ import torch
 import tipl
 import weighttraj as wt
 from tests.pages import QUICKER, blocks, run_command, run_page
+from tipl.live.results import read_live
 
 DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
@@ -131,6 +132,30 @@ def test_evaluate(reader: Path, brief_released: Path, monkeypatch: pytest.Monkey
     board = Path("data/demo/leaderboard/leaderboard.md").read_text()
     assert "| theirs | 1 | " in board
     assert "| relex-50 | 2 | " in board
+
+
+def test_live(reader: Path) -> None:
+    names = run_page(DOCS / "live.md", {"16 * 2048": "2 * 2048", "first=3": "first=1"})
+    assert [jump.iteration for jump in names["callback"].jumps] == [1]
+    results = read_live(reader / "data/demo/study/test/results.json")
+    assert {one.arm: len(one.curves) for one in results.series} == {
+        "ppo": 3,
+        "outer-step": 3,
+        "ema": 3,
+    }
+
+
+def test_the_example_shows_both_curves(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = (DOCS.parent / "examples/jump_ahead.py").read_text()
+    for long, short in {"16 * 2048": "2 * 2048", "first=3": "first=1"}.items():
+        assert long in script
+        script = script.replace(long, short)
+    exec(compile(script, "jump_ahead.py", "exec"), {})  # noqa: S102
+    shown = capsys.readouterr().out
+    assert shown.count("episode_reward=") == 4
+    assert "after iteration 1: 20 snapshots ahead, accepted" in shown
 
 
 def test_the_page_of_what_is_supported_says_what_was_tried(
