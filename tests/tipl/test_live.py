@@ -25,6 +25,7 @@ from tipl.live.plan import ppo_of, read_plan
 from tipl.live.results import Cpu, Curve, Series, read_live
 from tipl.live.study import LiveConfig, run_live
 from tipl.live.summary import compare, mean_log_ratio, steps_to, thresholds_of
+from tipl.registry import unfitted
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.collect.agents import find_agent
 from weighttraj.collect.describe import describe_run
@@ -123,6 +124,23 @@ def test_the_released_gate_forecasts_as_from_a_stored_run(tmp_path: Path) -> Non
     learn(config, [recorder, Recorded(gate, JumpConfig(horizon=50, log_std=True, first=1))])
     run = wt.open_run(tmp_path / "run.zarr")
     np.testing.assert_allclose(gate.forecast(run, [5, 10], [50])[:, 0], made, atol=1e-6)
+
+
+RELEASED = ("tipl-gate", "tipl-drift", "tipl-causal", "ar-20-phase")
+
+
+@pytest.mark.parametrize("name", [*unfitted(), *(f"{m}-inverted-pendulum-v4" for m in RELEASED)])
+def test_a_run_in_memory_is_forecast_as_a_stored_one(name: str, full_run: wt.Run) -> None:
+    """Also when it has grown since the last forecast."""
+    forecaster, growing = tipl.load(name), GrowingRun(full_run.info)
+    weights, columns = full_run.weights[:], ("num_timesteps", "iteration", "phase")
+    for t in range(len(full_run)):
+        index = {column: int(full_run[f"index/{column}"][t]) for column in columns}
+        index["gradient_step"] = int(full_run["index/gradient_step"][t])
+        growing.append(weights[t], learning_rate=float(full_run.learning_rate[t]), **index)
+        if t in (4, 5, 10, 15):
+            stored = forecaster.forecast(full_run, [t], [10])
+            np.testing.assert_array_equal(forecaster.forecast(growing, [t], [10]), stored)
 
 
 def test_a_recorded_training_says_where_it_jumped(tmp_path: Path) -> None:
