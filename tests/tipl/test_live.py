@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 
 import tipl
 import weighttraj as wt
@@ -179,6 +181,10 @@ def test_a_jump_that_ruins_the_return_is_undone(name: str) -> None:
     callback = Bad(Ahead(3.0), replace(OUTER, last=1, guard="rollout", episodes=2))
     model = learn(config, callback)
     assert [jump.outcome for jump in callback.jumps] == ["undone"]
+    path = callback._path
+    assert path is not None
+    assert path._run.phase.tolist() == [-1, *[0, 1, 2, 3] * 3]
+    assert np.abs(np.diff(path._run.rows, axis=0)).max() < 1
     before, after = kept
     for old, new in zip(before, after, strict=True):
         np.testing.assert_array_equal(old, new)
@@ -196,6 +202,22 @@ def test_the_batch_guard_refuses_what_the_last_rollout_speaks_against() -> None:
     assert not passes_batch(0.01, 0.2, 0.1, config)
     assert not passes_batch(0.1, 0.1, 0.2, config)
     assert not passes_batch(0.01, 0.1, float("nan"), config)
+
+
+def test_the_batch_guard_takes_dictionaries_of_observations() -> None:
+    env = make_vec_env(
+        lambda: gym.wrappers.TransformObservation(
+            gym.make("Pendulum-v1"),
+            lambda seen: {"all": seen},
+            gym.spaces.Dict({"all": gym.make("Pendulum-v1").observation_space}),
+        ),
+        n_envs=2,
+        seed=0,
+    )
+    callback = ForecastCallback(Ahead(0.01), replace(OUTER, guard="batch", max_kl=1e-9))
+    settings: Any = {"n_steps": 16, "batch_size": 8, "n_epochs": 2, "device": "cpu"}
+    PPO("MultiInputPolicy", env, seed=0, **settings).learn(96, callback=callback)
+    assert [jump.outcome for jump in callback.jumps] == ["refused"] * 2
 
 
 def test_a_return_falls_when_it_falls_beyond_its_noise() -> None:
@@ -294,6 +316,9 @@ def test_a_population_undoes_a_bad_jump_of_one_learner(normalization: Any) -> No
     population.train(jumps.watchers, hook=hook)
     population.close()
     assert [one.outcome for one in jumps.jumps[0]] == ["undone"]
+    path = jumps.learners[0].path
+    assert path._run.phase.tolist() == [-1, *[0, 1, 2, 3] * 3]
+    assert np.abs(np.diff(path._run.rows, axis=0)).max() < 1
     before, after = states
     assert torch.equal(before.parameters, after.parameters)
     for name in before.moments:

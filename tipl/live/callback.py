@@ -83,7 +83,7 @@ class ForecastCallback(BaseCallback):
         self._before: _Before | None = None
         self._fallen = False
         self._path: TrainingPath | None = None
-        self._batch: dict[str, np.ndarray] = {}
+        self._batch: dict[str, Any] = {}
         self._hook: Any = None
         self._agent: Agent
 
@@ -133,10 +133,8 @@ class ForecastCallback(BaseCallback):
         self._returns = []
         if self.config.guard == "batch":
             buffer = self.model.rollout_buffer
-            self._batch = {
-                name: getattr(buffer, name)
-                for name in ("observations", "actions", "log_probs", "advantages")
-            }
+            names = ("observations", "actions", "log_probs", "advantages")
+            self._batch = {name: _kept(getattr(buffer, name)) for name in names}
 
     def _on_gradient_step(self, *_: object) -> None:
         path = cast(TrainingPath, self._path)
@@ -189,9 +187,8 @@ class ForecastCallback(BaseCallback):
         if old is None:
             return True
         new = self._judge()
-        kl = float(
-            kl_divergence(old[0], new[0]).reshape(len(self._flat("log_probs")), -1).sum(1).mean()
-        )
+        each = kl_divergence(old[0], new[0])  # (sample,) or (sample, action)
+        kl = float(each.reshape(len(each), -1).sum(1).mean())
         if passes_batch(kl, old[1], new[1], self.config):
             return True
         self._write(before)
@@ -208,11 +205,12 @@ class ForecastCallback(BaseCallback):
         clip = cast(Any, self.model.clip_range)(self.model._current_progress_remaining)
         return distribution, surrogate(change, self._flat("advantages"), clip)
 
-    def _flat(self, name: str) -> torch.Tensor:
+    def _flat(self, name: str) -> Any:
         """Return a part of the last rollout with its steps and environments in one axis."""
-        rows = self._batch[name]
-        shape = rows.shape[2:]
-        return torch.as_tensor(rows.reshape(-1, *shape), device=self.model.device)
+        rows, device = self._batch[name], self.model.device
+        if isinstance(rows, dict):
+            return {key: _flattened(value, device) for key, value in rows.items()}
+        return _flattened(rows, device)
 
     def _undo(self, now: Float32[np.ndarray, " param"], before: _Before) -> None:
         """Put everything back to what it was before the jump; the environment steps are spent."""
@@ -294,6 +292,15 @@ def _recorders(callback: Any) -> list[WeightTrajectoryCallback]:
     if isinstance(callback, CallbackList):
         return [found for one in callback.callbacks for found in _recorders(one)]
     return [callback] if isinstance(callback, WeightTrajectoryCallback) else []
+
+
+def _kept(rows: Any) -> Any:
+    """Return arrays of a rollout buffer that stay as they are when the buffer is read or reset."""
+    return dict(rows) if isinstance(rows, dict) else rows
+
+
+def _flattened(rows: np.ndarray, device: torch.device) -> torch.Tensor:
+    return torch.as_tensor(rows.reshape(-1, *rows.shape[2:]), device=device)
 
 
 def _beside(run: Path) -> Path:

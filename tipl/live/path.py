@@ -151,7 +151,11 @@ class TrainingPath:
     def moved(
         self, before: Float32[np.ndarray, " param"], after: Float32[np.ndarray, " param"]
     ) -> None:
-        """Leave a change of the weights that was no training out of the path."""
+        """Leave a change of the weights that was no training out of the path.
+
+        Such changes come at iteration boundaries only.
+        """
+        self._step_before = self._step
         change = after.astype(np.float64) - before
         self._offset = change if self._offset is None else self._offset + change
         self._before = np.array(after)
