@@ -75,7 +75,7 @@ class Gate(SavedNetwork[GateNetwork, GateModelConfig]):
         self.network.eval()
         with threads():
             for place, history in histories(run, starts, sizes.lags, sizes.betas):
-                with torch.no_grad():
+                with torch.inference_mode():
                     now = adam.at(history.t) if adam else None
                     seen = features(history, structure, clock, sizes, now)
                     moved = self.displacements(seen, structure, rows)

@@ -143,7 +143,7 @@ class GateNetwork(nn.Module):
         hidden = self.context(context)
         count = len(self.experts)
         filters = torch.cat([self.experts, self.of_tensor(hidden)[None]])
-        filters = filters.view(count + 1, *self.basis_scale.shape) * self.basis_scale
+        filters = filters.view(count + 1, *self.basis_scale.shape)[..., horizons]
         # The context is the same for all parameters of the tensor: one more bias.
         first = self.first.bias + self.first_context(hidden)
         second = self.second.bias + self.second_context(hidden)
@@ -151,7 +151,9 @@ class GateNetwork(nn.Module):
         z = torch.addmm(second[:, None], self.second.weight, z).relu_()
         gates = torch.addmm(self.gate.bias[:, None], self.gate.weight, z)
         # Each filter's forecast, then their mixture: cheaper than mixing the filters.
-        wanted = filters[..., horizons].transpose(1, 2)  # (filter, horizon, basis)
+        wanted = (filters * self.basis_scale[:, horizons]).transpose(
+            1, 2
+        )  # (filter, horizon, basis)
         each = (wanted.flatten(0, 1) @ basis).view(count + 1, len(horizons), -1)
         moved: Tensor = (each[:count] * gates[:, None]).sum(0).add_(each[count])
         return moved
