@@ -372,7 +372,7 @@ def test_the_page_stands_alone_and_says_who_wins(
 ) -> None:
     page = (config.out / "report.html").read_text()
     assert page.count("<svg") == 5
-    assert "TIPL loses to persistence" in page
+    assert "TIPL, which uses the future of the run, has" in page
     for outside in ('src="http', 'href="http', "<script", "@import"):
         assert outside not in page
     pictures = list(config.out.glob("*.png"))
@@ -406,7 +406,7 @@ def test_the_verdict_is_plain(skills: tuple[float, float], said: str) -> None:
         for h, v in zip((1, 10), skills, strict=True)
     ]
     forecasters = {"persistence": scores(rows, 2.0), "tipl": scores(rows, 3.0)}
-    document = json.loads((ROOT / "datasets/demo/results.json").read_text())
+    document = json.loads((ROOT / "tests/tipl/results.json").read_text())
     text = verdict(msgspec.convert(document | {"forecasters": forecasters}, Results))
     assert f"TIPL {said}" in text
     assert "1.5 times that of persistence" in text

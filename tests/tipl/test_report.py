@@ -15,18 +15,27 @@ import pytest
 from tipl.commands.evaluate import _table
 from tipl.errors import EvaluateError
 from tipl.evaluation.results import Measure, Results, Row, read_results, write_document
-from tipl.report.figures import OTHERS, figures, file_name, skill_figure, styles, titles
+from tipl.report.figures import (
+    OTHERS,
+    figures,
+    file_name,
+    gain_figure,
+    skill_figure,
+    styles,
+    titles,
+)
 from tipl.report.markdown import insert_markdown, places, render, rewrite
 from tipl.report.page import write_report
 from tipl.report.scores import GAIN, SKILL, row_at, shown
+from tipl.report.sentences import findings, sentences
 from tipl.report.tables import cell, tables
 from tipl.report.verdict import paragraphs, verdict
 from weighttraj.errors import FormatError
 from weighttraj.terminal import Output
 
 ROOT = Path(__file__).parents[2]
-DEMO = Path("datasets/demo/results.json")
-SECTIONS = ("overview", "verdict", "tables", "figures", "source")
+DEMO = Path("tests/tipl/results.json")
+SECTIONS = ("overview", "table", "findings", "verdict", "tables", "figures", "source")
 
 
 @pytest.fixture
@@ -121,7 +130,15 @@ def test_the_others_are_grey_and_share_an_entry(many: dict[str, Any]) -> None:
 
 def test_a_line_below_the_frame_is_named(demo: dict[str, Any]) -> None:
     (text,) = skill_figure(typed(demo)).axes[0].texts
-    assert text.get_text() == "further down: TIPL"
+    lowest = min(row.value or 0 for row in SKILL(typed(demo).forecasters["tipl"]))
+    assert text.get_text() == f"below the frame:\nTIPL (down to {lowest:.3g})"
+
+
+def test_a_line_above_the_frame_is_named(many: dict[str, Any]) -> None:
+    rows = many["forecasters"]["tipl-2"]["gain"]["held"]
+    rows[0] |= {"value": 2.5, "low": 2, "high": 3}
+    said = [text.get_text() for axes in gain_figure(typed(many)).axes for text in axes.texts]
+    assert any("above the frame" in each and "tipl-2 (up to 2.5)" in each for each in said)
 
 
 def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
@@ -131,6 +148,36 @@ def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
 
 
 # The verdict
+
+
+def test_sentences_say_what_was_done_found_and_how_sure_it_is(many: dict[str, Any]) -> None:
+    first, tipl, second, rivals, bound, last = sentences(typed(many))
+    assert first.startswith("The models forecast the weights of 10 runs that they were not")
+    error = 1 - (row_at(typed(many).forecasters["tipl"], SKILL, 10) or Row(h=10, value=0)).value
+    assert f"{error:.0f} times [" in tipl
+    assert "TIPL, which uses the future of the run, has " in tipl
+    assert second == (
+        "tipl-2 removes 50 % [49, 51] of the error of persistence at h = 1 and 50 % [49, 51] at "
+        "h = 10; its policies gain 50 % [49, 51] of the return that training "
+        "gains in 50 snapshots."
+    )
+    assert rivals.startswith(
+        "The best of 20 baselines are: in weight error, base-19, which removes"
+    )
+    assert "in return, base-0, which gains 0 % [-1, 1] at h = 50" in rivals
+    assert bound.startswith("reconstruction (oracle), rank 32 is a bound and not a forecast")
+    assert last.startswith("This is a quick evaluation")
+
+
+def test_sentences_about_baselines_alone_or_one_run(demo: dict[str, Any]) -> None:
+    alone = {"persistence": demo["forecasters"]["persistence"]}
+    alone["ema-0.9"] = shifted(alone["persistence"], 0.005)
+    one = typed(demo | {"forecasters": alone, "runs": ["seed0040"], "split": "train"})
+    first, finding, last = sentences(one)
+    assert first.startswith("The baselines forecast the weights of 1 run that they may have been")
+    assert "ema-0.9 has about the error of persistence at h = 1 and" in finding
+    assert findings(one) == [finding]
+    assert last.endswith("with one run there are no intervals.")
 
 
 def test_the_verdict_answers_in_weights_in_return_and_in_gain(many: dict[str, Any]) -> None:
@@ -219,8 +266,9 @@ def test_every_section_is_written_in_its_place(demo: dict[str, Any], tmp_path: P
 def test_without_a_section_it_is_the_overview(demo: dict[str, Any]) -> None:
     bare = f"<!-- results of {DEMO} -->\n<!-- end of results -->\n"
     text = rewrite(bare, "results", str(DEMO), lambda section: render(typed(demo), DEMO, section))
-    assert f"| TIPL | {told(demo, SKILL, 1)} |" in text
-    assert verdict(typed(demo)) in text
+    value = cell(row_at(typed(demo).forecasters["tipl"], SKILL, 1), interval=False)
+    assert f"| TIPL | {value} |" in text
+    assert all(sentence in text for sentence in sentences(typed(demo)))
 
 
 def test_important_tables_are_open_and_the_others_folded(demo: dict[str, Any]) -> None:
@@ -262,7 +310,9 @@ def test_a_page_without_a_place_is_refused(demo: dict[str, Any], tmp_path: Path)
 def test_an_unknown_section_is_refused(demo: dict[str, Any], tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(page_of("poem"))
-    with pytest.raises(EvaluateError, match=r"no such section of results(.|\n)*overview, verdict"):
+    with pytest.raises(
+        EvaluateError, match=r"no such section of results(.|\n)*overview, table, findings"
+    ):
         insert_markdown(typed(demo), DEMO, page)
 
 

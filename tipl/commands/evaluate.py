@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated
 
 import tyro
+from rich import box
 from rich.markup import escape
 from rich.table import Table
 
@@ -24,12 +26,13 @@ from tipl.report import tables
 from tipl.report.markdown import insert_markdown
 from tipl.report.page import evaluate as evaluate_all
 from tipl.report.page import write_report
-from tipl.report.tables import cell, headline, label
-from tipl.report.verdict import verdict
+from tipl.report.sentences import sentences
+from tipl.report.tables import cell, compact, headline, label
 from weighttraj.errors import WeightTrajError
 from weighttraj.remote.address import here, new_path
 from weighttraj.terminal import Output, say
 
+NO_BREAK = "\N{NO-BREAK SPACE}"
 WIDE = 150
 """Number of characters that a table with intervals needs."""
 
@@ -95,10 +98,22 @@ def _evaluate_on(args: EvaluateCommand, data: str, out: Path) -> list[str]:
         },
     )
     console.print(_table(results, console))
-    say(verdict(results))
+    for sentence in sentences(results):
+        say(_wrapped(sentence, console.width))
     say(f"report: {out / 'report.html'}")
     faults = {f"run {run}": why for run, why in results.left_out.items()} | results.failed
     return [f"{results.data}: {what}: {why}" for what, why in faults.items()]
+
+
+def _wrapped(sentence: str, width: int) -> str:
+    """Return a sentence as an item of a list; figures such as ``h = 10`` are not broken."""
+    kept = re.sub(r"h = |, (?=-?[\d.]+\])|\d (?=[%\[])|% (?=\[)|times (?=\[)", _unbroken, sentence)
+    lines = wrap(kept, width, initial_indent="- ", subsequent_indent="  ")
+    return "\n".join(lines).replace(NO_BREAK, " ")
+
+
+def _unbroken(match: re.Match[str]) -> str:
+    return match[0].replace(" ", NO_BREAK)
 
 
 def check(
@@ -157,25 +172,22 @@ def report(
 
 def _table(results: Results, console: Output) -> Table:
     """Return the overview; where there is no room, without intervals, and with fewer columns."""
-    overview = headline(results)
-    shown = range(len(overview.columns))
-    table = _overview(results, overview, shown, interval=console.width >= WIDE)
+    table = _overview(results, headline(results), interval=console.width >= WIDE)
     anything = console.options.update_width(1_000)  # else it measures what the console has
-    if console.measure(table, options=anything).minimum > console.width:
-        few = [i for i in shown if overview.columns[i].startswith(("skill", "gain"))]
-        table = _overview(results, overview, few, interval=False)
+    if console.measure(table, options=anything).maximum > console.width:
+        table = _overview(results, compact(results), interval=False)
         table.caption = "the report has more columns, and intervals"
     return table
 
 
-def _overview(
-    results: Results, overview: tables.Table, shown: Iterable[int], *, interval: bool
-) -> Table:
-    table = Table(title=f"{results.data}, {results.split} runs: {', '.join(results.runs)}")
-    table.add_column("forecaster", no_wrap=True)
-    for i in shown:
-        table.add_column(overview.columns[i], justify="right")
+def _overview(results: Results, overview: tables.Table, *, interval: bool) -> Table:
+    many = f"{len(results.runs)} runs" if len(results.runs) != 1 else "1 run"
+    title = f"{results.data}: {many} of the {results.split} split"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("forecaster", no_wrap=True, vertical="bottom")
+    for column in overview.columns:
+        table.add_column(column.replace(", ", "\n"), justify="right", no_wrap=True)
     for name, cells in overview.rows:
-        texts = (cell(cells[i], interval=interval) for i in shown)
+        texts = (cell(row, interval=interval) for row in cells)
         table.add_row(label(name), *(escape(text) for text in texts))
     return table

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn, get_type_hints
 
+from tipl.training.checkpoint import read_log
 from tipl.training.parallel import rank_here
 from weighttraj.remote.address import new_path
 from weighttraj.terminal import Output, say
+
+BARS = "▁▂▃▄▅▆▇█"
+WIDTH = 20
+"""Largest number of bars, about."""
+ERRORS = {
+    "wpe": "WPE on training runs",
+    "validation_wpe": "WPE on validation runs",
+    "error": "error on training runs",
+    "validation_error": "error on validation runs",
+}
+"""Errors in a log, and what they are called."""
 
 
 def trainer(train: Callable[..., Any]) -> Callable[..., None]:
@@ -24,11 +37,34 @@ def trainer(train: Callable[..., Any]) -> Callable[..., None]:
         found = train(config, console=Output())
         if rank_here() == 0:
             what = f"{len(found)} baselines" if isinstance(found, list) else "model"
+            for line in curves(read_log(config.out)):
+                say(line)
             say(f"{what} in {config.out}")
 
     command.__annotations__["config"] = get_type_hints(train)["config"]
     command.__doc__ = train.__doc__
     return command
+
+
+def curves(log: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return a line for each error of a training's log: its curve, its first and its last value.
+
+    The bars are on a logarithmic scale, from the smallest value to the largest one.
+    """
+    return [
+        _curve(name, [(line["batch"], line[key]) for line in log if key in line])
+        for key, name in ERRORS.items()
+        if sum(key in line for line in log) > 1
+    ]
+
+
+def _curve(name: str, points: list[tuple[float, float]]) -> str:
+    step = max(1, len(points) // WIDTH)
+    heights = [math.log(max(value, 1e-30)) for _, value in points[::step]]
+    low, span = min(heights), max(max(heights) - min(heights), 1e-9)
+    bars = "".join(BARS[round((height - low) / span * (len(BARS) - 1))] for height in heights)
+    first, last = (f"{value:.3g} at batch {batch:,.0f}" for batch, value in (points[0], points[-1]))
+    return f"{name} {bars} {first}, {last}"
 
 
 def _stop(*_: object) -> NoReturn:

@@ -101,7 +101,7 @@ def _bands(results: Results, panels: dict[str, Measure], y: str, top: float) -> 
             _draw_band(axes, measure(results.forecasters[name]), style)
         axes.set_xscale("log")
         axes.set_ylim(_LOWEST, top)
-        _name_those_below(axes)
+        _name_those_outside(axes)
         axes.set_title(title, fontsize=10)
         _label(axes, "horizon h, snapshots", y if axes is all_axes[0] else "")
     _legend(fig)
@@ -210,13 +210,20 @@ def _draw_band(axes: Axes, rows: Sequence[Row], style: Style) -> None:
         axes.fill_between(h, low, high, alpha=0.15, color=style["color"], linewidth=0)
 
 
-def _name_those_below(axes: Axes) -> None:
-    """Name the lines with a colour that lie below the frame."""
-    heights = {str(line.get_label()): np.asarray(line.get_ydata()) for line in axes.get_lines()}
-    below = [text for text, y in heights.items() if text != OTHERS and y.max() < _LOWEST]
-    if below:
-        text = f"further down: {', '.join(below)}"
-        axes.text(0.02, 0.02, text, transform=axes.transAxes, fontsize=8)
+def _name_those_outside(axes: Axes) -> None:
+    """Name the lines with a colour that leave the frame, each with its most extreme value."""
+    low, high = axes.get_ylim()
+    lines = [
+        (str(line.get_label()), np.asarray(line.get_ydata(), float))
+        for line in axes.get_lines()
+        if line.get_label() != OTHERS
+    ]
+    below = [f"{text} (down to {y.min():.3g})" for text, y in lines if y.min() < low]
+    above = [f"{text} (up to {y.max():.3g})" for text, y in lines if y.max() > high]
+    for names, y, where, va in ((below, 0.02, "below", "bottom"), (above, 0.98, "above", "top")):
+        if names:
+            text = "\n".join([f"{where} the frame:", *names])
+            axes.text(0.02, y, text, transform=axes.transAxes, fontsize=7, va=va, zorder=5)
 
 
 def _label(axes: Axes, x: str, y: str) -> None:

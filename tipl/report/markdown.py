@@ -7,7 +7,9 @@ same way, with another word for *results*.
 
 | section | what it shows |
 |---|---|
-| ``overview`` | the few columns that matter, and the verdict |
+| ``overview`` | skill and gain without intervals, and the verdict in plain sentences |
+| ``table`` | the table of the overview |
+| ``findings`` | one sentence for each model, and one about the best baselines |
 | ``verdict`` | the sentences only |
 | ``tables`` | all tables, the less important ones folded |
 | ``figures`` | pictures, which lie in a folder beside the page, named after the result file |
@@ -27,12 +29,13 @@ import jinja2
 from tipl.errors import EvaluateError
 from tipl.evaluation.results import Results
 from tipl.report.figures import figures, file_name, png, titles
-from tipl.report.tables import Table, cell, headline, label, tables
+from tipl.report.sentences import findings, sentences
+from tipl.report.tables import Table, cell, compact, label, tables
 from tipl.report.verdict import paragraphs
 from weighttraj import text
 from weighttraj.atomic import replace_file
 
-SECTIONS = ("overview", "verdict", "tables", "figures", "source")
+SECTIONS = ("overview", "table", "findings", "verdict", "tables", "figures", "source")
 DPI = 110
 """Resolution of pictures in Markdown pages."""
 
@@ -123,7 +126,9 @@ def render(results: Results, source: Path, section: str) -> str:
         "causal": [name for name, scores in results.forecasters.items() if scores.causal],
         "all_tables": tables,
         "file_name": file_name,
-        "headline": headline,
+        "compact": compact,
+        "findings_of": findings,
+        "sentences": sentences,
         "paragraphs": paragraphs,
         "table_lines": table_lines,
         "titles": titles,
@@ -159,14 +164,14 @@ def section_of(template: str, section: str, context: dict[str, Any]) -> str:
     return str(getattr(sections, section)()).strip("\n")
 
 
-def table_lines(table: Table) -> list[str]:
+def table_lines(table: Table, *, interval: bool = True) -> list[str]:
     """Return a table, line by line."""
     lines = [
         "| forecaster | " + " | ".join(table.columns) + " |",
         "|---|" + "---:|" * len(table.columns),
     ]
     for name, cells in table.rows:
-        shown = " | ".join(cell(row, table.digits) for row in cells)
+        shown = " | ".join(cell(row, table.digits, interval=interval) for row in cells)
         lines.append(f"| {text.markdown(label(name))} | {shown} |")
     return lines
 

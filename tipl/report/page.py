@@ -14,8 +14,8 @@ from tipl.evaluation.results import Results
 from tipl.evaluation.rows import Seen
 from tipl.forecaster import Forecaster
 from tipl.report.figures import figures, file_name, png, svg
-from tipl.report.tables import cell, headline, label, tables
-from tipl.report.verdict import verdict
+from tipl.report.sentences import sentences
+from tipl.report.tables import cell, compact, label, tables
 from weighttraj.atomic import replace_file
 
 
@@ -79,8 +79,8 @@ def write_report(results: Results, out: Path) -> Path:
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     page = environment.get_template("report.html").render(
         results=results,
-        verdict=verdict(results),
-        overview=headline(results),
+        sentences=sentences(results),
+        overview=compact(results),
         tables=tables(results),
         figures={title: svg(figure) for title, figure in drawn.items()},
         label=label,

@@ -132,6 +132,17 @@ def headline(results: Results) -> Table:
     return Table(title="Overview", columns=tuple(title for title, _, _ in columns), rows=rows)
 
 
+def compact(results: Results) -> Table:
+    """Return the columns of the overview that fit a narrow page: skill and gain."""
+    overview = headline(results)
+    chosen = [i for i, title in enumerate(overview.columns) if title.startswith(("skill", "gain"))]
+    return Table(
+        title=overview.title,
+        columns=tuple(overview.columns[i] for i in chosen),
+        rows=[(name, [cells[i] for i in chosen]) for name, cells in overview.rows],
+    )
+
+
 def _horizons(results: Results, measure: Measure, usual: Sequence[int]) -> list[int]:
     """Return the horizons of a figure in the overview: the usual ones, or those there are."""
     each = ([row.h for row in measure(scores)] for scores in results.forecasters.values())
