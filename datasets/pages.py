@@ -5,7 +5,7 @@ python datasets/pages.py --measure [ID ...]
 reads the runs of each data set, in ``datasets/<id>/data`` and in ``data/<id>``, where they are
 collected, and keeps the figures in ``datasets/<id>/facts.json``. Then, and without ``--measure``
 only this, it writes ``datasets/<id>/README.md`` and ``curves.svg`` of each data set that has such
-figures, and the table in ``datasets/README.md``.
+figures, the table in ``datasets/README.md``, and the short one in the ``README.md`` above it.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from weighttraj.text import between
 DATASETS = Path(__file__).parent
 COLLECTED = DATASETS.parent / "data"
 PAGE = DATASETS / "README.md"
+FRONT = DATASETS.parent / "README.md"
 START = "<!-- data sets: rewrite with `python datasets/pages.py` -->"
 END = "<!-- end of the data sets -->"
 SPLITS = ("train", "validation", "test")
@@ -137,6 +138,7 @@ def main() -> None:
             (DATASETS / recipe.id / "README.md").write_text(render(recipe, facts))
             (DATASETS / recipe.id / "curves.svg").write_text(draw(recipe.id, facts))
     PAGE.write_text(insert(PAGE.read_text()))
+    FRONT.write_text(insert_short(FRONT.read_text()))
 
 
 def recipes() -> list[Recipe]:
@@ -457,6 +459,31 @@ def table() -> str:
 def insert(page: str) -> str:
     """Return the page of all data sets with the table as it is now."""
     return between(page, START, END, table())
+
+
+def short_table() -> str:
+    """Return the data sets whose runs are in this repository, in few columns."""
+    lines = ["| data set | task | runs | snapshots of each | MB | return at the end |"]
+    lines.append("|---|---|---:|---:|---:|---:|")
+    for recipe in recipes():
+        facts = facts_of(recipe.id)
+        if facts is None or facts.here is None:
+            continue
+        cells = [
+            f"[{recipe.id}](datasets/{recipe.id}/README.md)",
+            recipe.ppo.env_id,
+            f"{sum(facts.here.runs.values())}",
+            f"{recipe.n_snapshots:,}",
+            f"{facts.here.megabytes:.0f}",
+            _number(next(iter(facts.final.values())).mean) if facts.final else "-",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def insert_short(page: str) -> str:
+    """Return the README of the repository with the short table as it is now."""
+    return between(page, START, END, short_table())
 
 
 def parameters_of(recipe: Recipe) -> int:

@@ -45,6 +45,8 @@ def test_the_table_is_fresh(pages: ModuleType) -> None:
     assert pages.insert(PAGE) == PAGE, "run: python datasets/pages.py"
     stale = PAGE.replace("| 71,948 |", "| 71,949 |")
     assert pages.insert(stale) == PAGE != stale
+    front = (ROOT / "README.md").read_text()
+    assert pages.insert_short(front) == front, "run: python datasets/pages.py"
 
 
 def test_sizes_of_a_recipe_are_those_of_its_runs(pages: ModuleType, small_dataset: Path) -> None:

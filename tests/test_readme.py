@@ -12,6 +12,7 @@ import pytest
 from tests.pages import QUICKER, blocks, run_page
 from tipl.evaluation.results import read_results
 from tipl.report.markdown import places, render, rewrite
+from tipl.zoo.table import models_table
 from weighttraj.policies import evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -21,34 +22,49 @@ PAGES = [ROOT / "README.md", *sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("cards
 
 def test_every_block_runs(reader: Path) -> None:
     shorter = {
-        "--n-batches 500": "--n-batches 4",
-        "--episodes 5": "--episodes 1",
-        "--quick --workers 2": f"{QUICKER} --horizons 1 10 50",
+        "--quick --horizons 1 10 50 --starts 100 --workers 2": f"{QUICKER} --horizons 1 10 50",
     }
-    names = run_page(ROOT / "README.md", shorter, skip=("make ", ". .venv"))
-    assert names["batch"]["weights"].shape == (64, 20, 122)
-    assert names["returns"].shape == (5, 20)
+    names = run_page(ROOT / "README.md", shorter, skip=("make ", "pip install"))
+    assert names["run"].id == "seed0040"
     before, after = (
-        evaluate(policies, names["unseen"], episodes=5).returns.mean()
-        for policies in (names["now"], names["now"].with_weights(names["jump"][None]))
+        evaluate(policies, names["run"], episodes=5).returns.mean()
+        for policies in (names["now"], names["ahead"])
     )
     assert after > before + 100
     assert (reader / "data/demo/report/report.html").exists()
-    assert (reader / ".local/share/bash-completion/completions/tipl").stat().st_size > 1000
+
+
+@pytest.mark.usefixtures("reader")
+def test_reading_prints_what_the_page_says(capsys: pytest.CaptureFixture[str]) -> None:
+    first = next(text for kind, text in blocks(ROOT / "README.md") if kind == "python")
+    said = [line.partition("  # ")[2] for line in first.splitlines() if line.startswith("print(")]
+    exec(compile(first, "README.md", "exec"), {})  # noqa: S102
+    assert capsys.readouterr().out.splitlines() == said
+
+
+def test_it_is_short() -> None:
+    assert sum(any(map(str.isalnum, word)) for word in README.split()) <= 900
 
 
 def test_the_makefile_runs_the_readmes_commands() -> None:
     makefile = (ROOT / "Makefile").read_text()
+    for name in ("RELEASED", "TIPL", "GATE"):
+        (value,) = re.findall(rf"^{name} := (.+)$", makefile, re.MULTILINE)
+        makefile = makefile.replace(f"$({name})", value)
     makefile = makefile.replace("$(BIN)/", "").replace("$(DEMO)", "data/demo")
-    commands = [
-        line
-        for kind, text in blocks(ROOT / "README.md")
-        if kind == "bash"
-        for line in text.splitlines()
-    ]
-    for name in ("weighttraj collect", "weighttraj returns", "tipl train", "tipl evaluate"):
-        command = next(line for line in commands if line.startswith(name))
-        assert command.split("  ")[0] in makefile
+    for page, names in {
+        "README.md": ["tipl evaluate"],
+        "docs/quickstart.md": ["weighttraj collect", "weighttraj returns", "tipl train"],
+    }.items():
+        commands = [
+            line
+            for kind, text in blocks(ROOT / page)
+            if kind == "bash"
+            for line in text.splitlines()
+        ]
+        for name in names:
+            command = next(line for line in commands if line.startswith(name))
+            assert command.split("  ")[0] in makefile
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -67,9 +83,18 @@ def test_the_numbers_come_from_their_files(page: Path, monkeypatch: pytest.Monke
         assert (page.parent / picture).exists(), picture
 
 
-def test_readme_shows_the_demo() -> None:
-    shown = [(place.what, place.source, place.empty) for place in places(README)]
-    assert shown == [("results", "datasets/demo/results.json", False)]
+def test_readme_shows_the_demo_the_results_and_the_models() -> None:
+    shown = [(place.what, place.source, place.section, place.empty) for place in places(README)]
+    assert shown == [
+        ("results", "datasets/demo/results.json", "table", False),
+        ("models", "zoo", "overview", False),
+        ("results", "docs/results/inverted-pendulum-v4-ppo-v1.json", "findings", False),
+    ]
+
+
+def test_the_table_of_models_is_that_of_the_zoo() -> None:
+    table = models_table(ROOT / "cards/models")
+    assert rewrite(README, "models", "zoo", lambda _: table) == README, "run: make readme"
 
 
 def test_the_benchmarks_come_from_the_file() -> None:

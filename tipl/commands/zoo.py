@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Literal
 
+import tyro
+from rich import box
 from rich.markup import escape
 from rich.table import Table
 
@@ -11,7 +14,7 @@ from tipl import registry
 from tipl.report.scores import GAIN, SKILL, row_at
 from tipl.report.tables import cell
 from tipl.zoo.metrics import read_metrics
-from weighttraj.terminal import Output
+from weighttraj.terminal import Output, say
 
 WIDE = 150
 """Number of characters that a table with intervals needs."""
@@ -23,16 +26,28 @@ HEADLINE = {
 """Columns that sum a model up: a figure and its horizon."""
 
 
-def zoo() -> None:
+def zoo(
+    into: Annotated[
+        Path | None, tyro.conf.arg(help="write the table between the markers of a Markdown page")
+    ] = None,
+) -> None:
     """List the released models."""
+    if into is not None:
+        from tipl.zoo.table import insert_models
+
+        insert_models(into)
+        say(f"models in {into}")
+        return
     console = Output()
-    table, wide = Table(), console.width >= WIDE
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    wide = console.width >= WIDE
     columns = {"name": True, "kind": wide, "causal": True, "data set": wide}
     columns |= dict.fromkeys(HEADLINE, True)
     for column, shown in columns.items():
         if shown:
             justify: Literal["left", "right"] = "right" if column in HEADLINE else "left"
-            table.add_column(column, justify=justify, no_wrap=column == "name")
+            head = column.replace(", ", "\n")
+            table.add_column(head, justify=justify, no_wrap=column != "data set", vertical="bottom")
     for name in registry.names():
         cells = zip(listed(name, interval=wide), columns.values(), strict=True)
         table.add_row(*(escape(text) for text, shown in cells if shown))
