@@ -35,6 +35,34 @@ def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPa
     assert study.STUDY.insert(stale) == page != stale
 
 
+GUIDES = (
+    "install quickstart glossary read collect train evaluate publish bring-your-own supported "
+    "clusters design"
+)
+
+
+@pytest.mark.parametrize("name", [*GUIDES.split(), "../weighttraj/format/FORMAT"])
+def test_a_guide_begins_with_what_its_reader_can_do(name: str) -> None:
+    _, first, *_ = (DOCS / f"{name}.md").read_text().split("\n\n")
+    assert first.startswith("After this page you ")
+
+
+def test_install(reader: Path) -> None:
+    run_page(DOCS / "install.md", skip=("pip install", "make "))
+    assert (reader / ".local/share/bash-completion/completions/tipl").stat().st_size > 1000
+
+
+def test_quickstart(reader: Path) -> None:
+    shorter = {
+        "--n-batches 400 --warmup": "--n-batches 4 --warmup",
+        "--episodes 5": "--episodes 1",
+        "--quick --horizons 1 10 50 --starts 100 --workers 2": f"{QUICKER} --horizons 1 10 50",
+    }
+    names = run_page(DOCS / "quickstart.md", shorter)
+    assert names["after"] > names["before"] + 100
+    assert Path("data/demo/report/report.html").exists()
+
+
 def test_bring_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_page(DOCS / "bring-your-own.md")
@@ -76,7 +104,7 @@ def test_train(
     """Two ranks of `torchrun` train in tests/tipl/test_distributed.py as well."""
     monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(brief_released.parent))
     shorter = {
-        "--n-batches 500": "--n-batches 4",
+        "--n-batches 400 --warmup": "--n-batches 4 --warmup",
         "--out data/demo/tipl-2 --n-batches 100": "--out data/demo/tipl-2 --n-batches 4",
         "--starts 100 --n-batches 100": "--starts 10 --n-batches 4",
         "--starts 100 --n-batches 400": "--starts 10 --n-batches 4",
