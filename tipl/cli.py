@@ -20,7 +20,7 @@ from tipl.registry import Kind, commands, imported
 from weighttraj.errors import WeightTrajError
 from weighttraj.terminal import Output, say, while_read
 
-DESCRIPTION = "Forecasts of policy weights: train models and evaluate them."
+DESCRIPTION = "Train and evaluate models that forecast the weights of policies."
 COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
 
@@ -50,7 +50,7 @@ COMMANDS = {
     ),
     "check": Command(
         "Use",
-        "Five tests that a causal forecaster should pass, as numbers.",
+        "Run five tests that a causal forecaster should pass.",
         "tipl.commands.evaluate:check",
     ),
     "report": Command(
@@ -60,10 +60,12 @@ COMMANDS = {
     ),
     "live": Command(
         "Use",
-        "Jump ahead inside PPO trainings: run the arms of a study, and compare them.",
+        "Let PPO trainings jump ahead to forecast weights; compare ways to jump.",
         "tipl.commands.live:live",
     ),
-    "release": Command("Publish", "Put a model into the zoo.", "tipl.commands.publish:release"),
+    "release": Command(
+        "Publish", "Add a model to the released models.", "tipl.commands.publish:release"
+    ),
     "card": Command("Publish", "Write the card of a released model.", "tipl.commands.publish:card"),
     "push": Command(
         "Publish",

@@ -221,7 +221,7 @@ for _kind in (
     Kind(
         name="tipl",
         forecaster="tipl.models.tipl.forecaster:TIPL",
-        help="The paper's model: a causal Transformer on the coefficients of an SVD.",
+        help="Train TIPL, the Transformer of the paper; hours.",
         command="tipl",
         train="tipl.models.tipl.train:train",
         refit="tipl.models.tipl.train:refit",
@@ -230,7 +230,7 @@ for _kind in (
     Kind(
         name="gate",
         forecaster="tipl.models.gate.forecaster:Gate",
-        help="tipl-gate: a small network shared by all parameters; minutes.",
+        help="Train tipl-gate, one network for all parameters; minutes.",
         command="gate",
         train="tipl.models.gate.train:train_gate",
         refit="tipl.models.gate.train:refit",
@@ -239,7 +239,7 @@ for _kind in (
     Kind(
         name="causal",
         forecaster="tipl.models.causal.forecaster:Causal",
-        help="tipl-causal: the Transformer without the look at the future.",
+        help="Train tipl-causal, TIPL on the past alone; minutes.",
         command="causal",
         train="tipl.models.causal.train:train_causal",
         refit="tipl.models.causal.train:refit",
@@ -248,7 +248,7 @@ for _kind in (
     Kind(
         name="drift",  # what saved ones are called: the first was tipl-drift
         forecaster="tipl.models.scaled.forecaster:ScaledGate",
-        help="Choose how far to follow a forecast, by returns of validation runs.",
+        help="Choose the length of a forecast by returns; minutes.",
         command="scaled",
         train="tipl.models.scaled.train:train_scaled",
         refit="tipl.models.scaled.train:refit",

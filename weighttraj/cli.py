@@ -34,8 +34,8 @@ Imports = Annotated[
 Scheduler = Annotated[
     str | None,
     tyro.conf.arg(
-        help="Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this "
-        "machine."
+        help="Address of a Dask cluster, tcp://host:port, or `local` for one with --workers "
+        "processes on this machine."
     ),
 ]
 
@@ -53,14 +53,14 @@ def _collect(
     scheduler: Scheduler = None,
     imports: Imports = (),
 ) -> None:
-    """Collect the data set of a recipe, or go on where it stopped.
+    """Train the runs of a recipe and store their snapshots; continue if it was stopped.
 
     Args:
         recipe: Recipe, a TOML file such as datasets/demo/recipe.toml.
         out: Folder of the data set. Default: data/<id of the recipe>.
         seeds: Only these seeds: 3, a range 0:50 (the end excluded), or several: 0:4,30:32. Default:
-            the recipe's.
-        workers: Processes, each with one thread, that train a run, or a population, at a time.
+            all seeds of the recipe.
+        workers: Number of processes; each trains one run, or one population, at a time.
     """
     from weighttraj.collect.settings import parse_seeds
 
@@ -94,19 +94,19 @@ def _returns(
     imports: Imports = (),
     replace: bool = False,
 ) -> None:
-    """Evaluate stored policies: their returns J(pi) become part of the runs; or go on.
+    """Play the stored policies and store their returns in the runs; continue if it was stopped.
 
     Args:
         path: Data set (path or id) or run.
         episodes: Episodes for each action mode; the same seeds for every policy.
-        every: Evaluate every so many-th snapshot, and the last one.
-        first: Also each of the first N snapshots: policies change most at the start.
-        learning: Also every N-th snapshot of the learning phase, until the return has come 95 % of
-            the way from its first to its final value; 0: none.
-        mode: How the policies act: the distribution's mode, samples, or both in turn.
+        every: Evaluate every N-th snapshot, and the last one.
+        first: Also evaluate each of the first N snapshots; policies change most at the start.
+        learning: Also evaluate every N-th snapshot of the learning phase, up to 95 % of the way
+            from the first to the final return; 0: none.
+        mode: Take deterministic actions (the mode of the distribution), sampled ones, or both.
         seed: Seed of the first episode.
-        workers: Processes, each with one thread.
-        replace: Evaluate anew what has returns of other episodes or other versions of the physics.
+        workers: Number of processes; each has one thread.
+        replace: Replace stored returns of other episodes or of other versions of the physics.
     """
     config = wt.policies.ReturnsConfig(
         episodes=episodes,
@@ -148,7 +148,7 @@ def _show(path: Positional[str]) -> None:
     """Print what a data set or a run holds.
 
     Args:
-        path: data set (path, id or address) or run
+        path: Data set (path, id or address) or run.
     """
     if is_remote(path):
         is_run = RemotePath.parse(path).name.removesuffix(".zip").endswith(".zarr")
@@ -166,7 +166,7 @@ def _show(path: Positional[str]) -> None:
 
 @app.command(name="list")
 def _list() -> None:
-    """List the data sets that can be named by an id here. `show ID` says where one lies."""
+    """List the local data sets by id. `show ID` prints the path of one."""
     table = Table(title="data sets")
     for column in ("id", "status", "runs", "MB"):
         justify: Literal["left", "right"] = "right" if column in ("runs", "MB") else "left"
@@ -186,11 +186,11 @@ def _search(
     query: Positional[str],
     columns: tuple[str, ...] = ("dataset", "run_id", "split", "seed", "final_return"),
 ) -> None:
-    """Find runs of all data sets that are here, by their environment, return, hyper-parameters.
+    """Find runs in all local data sets by environment, return and hyper-parameters.
 
     Args:
-        query: a condition, such as "env == 'HalfCheetah-v4' and final_return > 3000"
-        columns: what is shown of each run; also env, algorithm, n_snapshots, n_params, ...
+        query: Condition, such as "env == 'HalfCheetah-v4' and final_return > 3000"
+        columns: Columns of the table; others are env, algorithm, n_snapshots, n_params, ...
     """
     found = registry.search(query, damaged=_left_out)
     table = Table(title=f"{len(found)} runs")
@@ -225,12 +225,12 @@ def _create(
     version: str = "1",
     licence: str = "CC-BY-4.0",
 ) -> None:
-    """Make a data set of runs of your own; these stay.
+    """Make a data set from runs of your own; the runs themselves stay.
 
     Args:
-        out: Folder of the new data set; its name becomes the data set's id.
+        out: Folder of the new data set; its name is the id.
         runs: Finished runs: folders or packed files.
-        split: Parts of the data set: run0=train run1=test; other runs are in no part.
+        split: Split of each run: run0=train run1=test; other runs are in no split.
         version: Version of the data.
         licence: Licence of the data, as an SPDX identifier.
     """
@@ -250,23 +250,23 @@ def _create(
 
 @app.command(name="combine")
 def _combine(paths: Positional[tuple[str, ...]], out: Path) -> None:
-    """Make one data set of the runs of several; these stay.
+    """Join the runs of several data sets in a new one; the old ones stay.
 
     Args:
-        paths: data sets: paths or ids
-        out: folder of the new data set
+        paths: Data sets: paths or ids.
+        out: Folder of the new data set.
     """
     say(registry.combine(paths, out, console=console))
 
 
 @app.command(name="select")
 def _select(path: Positional[str], seeds: str, out: Path) -> None:
-    """Make a data set of some runs of another one; it says which part it is of what.
+    """Make a data set from some runs of another one; it records which part of it.
 
     Args:
-        path: data set: path or id
-        seeds: seeds of the runs, such as 0:4,30,40:44
-        out: folder of the new data set
+        path: Data set: path or id.
+        seeds: Seeds of the runs, such as 0:4,30,40:44.
+        out: Folder of the new data set.
     """
     from weighttraj.collect.settings import parse_seeds
 
@@ -280,13 +280,13 @@ def _split(
     fractions: tuple[float, float, float] = (0.6, 0.2, 0.2),
     seed: int = 0,
 ) -> None:
-    """Divide the runs of a data set anew, in a new data set.
+    """Make a data set with the same runs and another split.
 
     Args:
-        path: data set: path or id
-        out: folder of the new data set
-        fractions: of the runs: training, validation, test
-        seed: of the draw
+        path: Data set: path or id.
+        out: Folder of the new data set.
+        fractions: Shares of the runs for train, validation and test.
+        seed: Seed of the draw.
     """
     say(registry.split(path, out, fractions=fractions, seed=seed, console=console))
 
@@ -300,15 +300,15 @@ def _download(
     arrays: tuple[str, ...] | None = None,
     revision: str | None = None,
 ) -> None:
-    """Bring a data set here, or a part of it; stopped, the same command goes on.
+    """Download a data set or a part of it; continue if it was stopped.
 
     Args:
         address: hf://organisation/name, s3://bucket/prefix, gs://, az://, https://, file://.
-        out: Folder to be made. Default: where it is found by its name from then on.
-        runs: Only these runs, by id.
-        steps: Only snapshots from one environment step to another one.
-        arrays: Beside the weights only these groups: critic, optimizer, probe, train, ret_norm,
-            eval.
+        out: New folder. Default: a folder in which `wt.open` finds it by its id.
+        runs: Download only these runs, by id.
+        steps: Download only snapshots from one environment step to another.
+        arrays: Download only these groups beside the weights: critic, optimizer, probe, train,
+            ret_norm, eval.
         revision: Branch, tag or commit, on the hub.
     """
     dataset = registry.download(
@@ -319,10 +319,10 @@ def _download(
 
 @app.command(name="card")
 def _card(path: Positional[str]) -> None:
-    """Write the card of a data set, or the facts into the one that is there; and croissant.json.
+    """Write the card and croissant.json of a data set; prose in an existing card stays.
 
     Args:
-        path: data set: path or id
+        path: Data set: path or id.
     """
     say(f"card in {registry.write_card(path)}")
 
@@ -334,13 +334,13 @@ def _upload(
     despite_lint: bool = False,
     private: bool = False,
 ) -> None:
-    """Publish a data set, whole or not at all; stopped, the same command goes on.
+    """Publish a data set at an address, whole or not at all; continue if it was stopped.
 
     Args:
-        path: Data set (path or id): complete, with a card and a licence.
+        path: Data set (path or id). It must be complete and have a card and a licence.
         address: hf://organisation/name, s3://bucket/prefix, gs://, az://, file://.
-        despite_lint: Publish what looks suspicious; say why in the card.
-        private: Of a new repository on the hub: only its organisation sees it.
+        despite_lint: Publish although `lint` reports something; say why in the card.
+        private: Make a new repository on the hub private.
     """
     place = registry.upload(
         path, address, despite_lint=despite_lint, private=private, console=console
@@ -350,11 +350,11 @@ def _upload(
 
 @app.command(name="delete")
 def _delete(name: Positional[str], yes: bool = False) -> None:
-    """Remove a data set from this machine. There is no way back.
+    """Remove a data set from this machine; this cannot be undone.
 
     Args:
-        name: id, as `list` shows it
-        yes: do not ask
+        name: Id, as `list` shows it.
+        yes: Do not ask.
     """
     place = registry.find(name).path
     if not yes and not _sure(f"remove {name}, all in {place}, from this machine?"):
@@ -378,13 +378,13 @@ def _verify(
     seed: int | None = None,
     imports: Imports = (),
 ) -> None:
-    """Is it whole? Exit with 1 if something is missing, damaged or not what it says.
+    """Check that data are complete and undamaged; exit with 1 if they are not.
 
     Args:
         path: Data set (path or id) or run.
-        deep: Decode every array, also where the manifest vouches for the bytes.
-        replay: Train so many snapshots of a run again and compare them.
-        seed: Which run is trained again. Default: the first.
+        deep: Decode every array, also if the manifest has the checksum of its file.
+        replay: Number of snapshots of a run to train again and compare; 0: none.
+        seed: Seed of the run that is trained again. Default: the first run.
     """
     import_modules(imports)
     place = locate(path)
@@ -396,10 +396,10 @@ def _verify(
 
 @app.command(name="lint")
 def _lint(path: Positional[str]) -> None:
-    """Is it what it says it is? Look for duplicates, gaps, jumps; exit with 1 on findings.
+    """Look for suspicious data: duplicates, gaps, jumps; exit with 1 if there are any.
 
     Args:
-        path: data set (path or id) or run
+        path: Data set (path or id) or run.
     """
     place = locate(path)
     findings = [str(finding) for finding in wt.lint(place, console=console)]
@@ -408,11 +408,11 @@ def _lint(path: Positional[str]) -> None:
 
 @app.command(name="repair")
 def _repair(path: Positional[str], cut: bool = False) -> None:
-    """Mend what can be mended without training, and say what is left to do.
+    """Repair what can be repaired without training, and print what is left to do.
 
     Args:
         path: Data set (path or id) or run.
-        cut: Drop damaged snapshots and those after them; collecting again restores them.
+        cut: Remove damaged snapshots and later ones; `collect` trains them again.
     """
     place = locate(path)
     for step in wt.repair(place, cut=cut):
@@ -426,12 +426,12 @@ def _pack(
     profile: Literal["default", "archive"] = "default",
     out: Path | None = None,
 ) -> None:
-    """Write a finished run into one file; the run itself stays.
+    """Write a finished run into one zip file; the run itself stays.
 
     Args:
         path: Finished run.
-        profile: ``default``: any Zarr v3 reader; ``archive``: smallest, lossless too, needs PCodec.
-        out: File to be written. Default: the run's path and .zip.
+        profile: `default` is for every Zarr v3 reader; `archive` is smaller and needs PCodec.
+        out: New file. Default: the path of the run with .zip.
     """
     say(wt.pack(path, profile=profile, out=out))
 
@@ -447,18 +447,17 @@ def _report(
     overwrite: bool = False,
     imports: Imports = (),
 ) -> None:
-    """Write a page that shows what a data set or a run holds: returns, steps, spectrum, film.
+    """Write a page about a data set or a run: returns, step sizes, spectrum, a film.
 
     Args:
         path: Data set (path or id) or run.
-        all: A gallery: pages of all data sets that `list` shows, of models by their cards, an
-            index.
-        cards: With --all: folder of the cards of models. Default: cards/models of the clone.
-        out: Page to be written, which opens from disk; with --all a folder. An earlier report is
-            replaced. Default: report.html, or gallery.
-        film: A short film of a policy at five moments of its training.
-        seed: Of the film's episodes.
-        overwrite: Replace the file, whatever it is.
+        all: Write a gallery: a page for each local data set and each model card, and an index.
+        cards: Folder of the model cards, with --all. Default: cards/models of the clone.
+        out: New page, or folder with --all; replaces an earlier report. Default: report.html or
+            gallery.
+        film: Add a short film of a policy at five moments of its training.
+        seed: Seed of the episodes in the film.
+        overwrite: Replace any existing file.
     """
     import_modules(imports)
     if all:
@@ -490,14 +489,14 @@ def _export(
     out: Path,
     t: int = -1,
 ) -> None:
-    """Write a run for other programs.
+    """Write a run, a snapshot or a data set for other programs.
 
     Args:
         path: Run; for hdf5 also a data set.
         to: hdf5: one file with everything; npy: weights.npy and tables; safetensors: one snapshot;
             sb3: one snapshot as a model that PPO.load reads, and its VecNormalize.
         out: File (hdf5, safetensors) or folder (npy, sb3) to be written.
-        t: Which snapshot. Default: the last.
+        t: Index of the snapshot. Default: the last.
     """
     if to == "hdf5":
         say(wt.export_hdf5(locate(path), out))
@@ -513,21 +512,21 @@ def _export(
 
 @app.command(name="import")
 def _import(file: Positional[str], out: Path) -> None:
-    """Make a data set of an HDF5 file that `export` wrote; every digest is checked.
+    """Make a data set from an HDF5 file of `export`; every checksum is verified.
 
     Args:
-        file: HDF5 file of an export
-        out: folder of the data set to be written
+        file: HDF5 file that `export` wrote.
+        out: Folder of the new data set.
     """
     say(wt.open(wt.import_hdf5(here(file), out)))
 
 
 @app.command(name="cache")
 def _cache(clear: bool = False) -> None:
-    """Where decoded runs are kept for training, and how large that is.
+    """Print the folder and the size of the cache of decoded runs.
 
     Args:
-        clear: remove every decoded run
+        clear: Remove all decoded runs.
     """
     from weighttraj.load import cache_folder, cache_size, clear_cache
 
@@ -567,7 +566,10 @@ def main() -> None:
             if sys.argv[1:] == ["--version"]:
                 say(f"weighttraj {wt.__version__}")
                 return
-            app.cli(prog="weighttraj", description="Policy weight trajectories as data.")
+            app.cli(
+                prog="weighttraj",
+                description="Record, store and load the weights of policies in training.",
+            )
     except (WeightTrajError, OSError) as error:
         errors.print(f"[red]error:[/red] {escape(str(error))}")
         sys.exit(1)

@@ -46,15 +46,15 @@ class EvaluateCommand(EvaluateConfig):
     """
 
     forecasters: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Folders of models and of fitted baselines; names of models of the zoo, or of baselines that
-    need no fit (``ema-0.95``, say); or classes, ``module:Class``. ``{data}`` in a name stands for
+    """Folders of models and of fitted baselines; names of released models, or of baselines that
+    need no fit, such as ``ema-0.95``; or classes, ``module:Class``. ``{data}`` in a name stands for
     the id of the data set: ``data/results/{data}/gate``."""
     data: tuple[str, ...]  # type: ignore[assignment]
     """Data sets: paths or ids."""
     workers: int = 1
     """Number of processes; each has one thread and takes a run at a time."""
     scheduler: str | None = None
-    """Let a Dask cluster do it: tcp://host:port, or local for one of --workers on this machine."""
+    """Address of a Dask cluster, tcp://host:port, or `local` for one with --workers processes here."""
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
     """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 
@@ -118,21 +118,31 @@ def _unbroken(match: re.Match[str]) -> str:
 
 def check(
     model: Annotated[
-        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, a model of the zoo, or a baseline")
+        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, a released model, or a baseline")
     ],
     data: Annotated[str, tyro.conf.arg(help="a data set; its first test run is used")],
     out: Annotated[Path, tyro.conf.arg(help="a JSON file")],
-    horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="snapshots ahead")] = (1, 2, 5, 10),
-    null_batches: Annotated[int, tyro.conf.arg(help="batches of training on walks")] = 2_000,
+    horizons: Annotated[tuple[int, ...], tyro.conf.arg(help="numbers of snapshots ahead")] = (
+        1,
+        2,
+        5,
+        10,
+    ),
+    null_batches: Annotated[
+        int, tyro.conf.arg(help="number of batches of the training on random walks")
+    ] = 2_000,
     null_walks: Annotated[
-        int, tyro.conf.arg(help="random walks: two are forecast, the others trained on")
+        int,
+        tyro.conf.arg(help="number of random walks: two are forecast, the others are trained on"),
     ] = 12,
-    seed: Annotated[int, tyro.conf.arg(help="seed of walks, symmetries and that training")] = 0,
+    seed: Annotated[
+        int, tyro.conf.arg(help="seed of the walks, the symmetries and the training")
+    ] = 0,
 ) -> None:
     """Run five tests that a causal forecaster should pass, and write what they measured.
 
-    They show whether it finds something in random walks, looks ahead, follows permuted and flipped
-    units and longer steps, and goes on along a line.
+    The tests show whether it has skill on random walks, uses the future, follows permuted and
+    flipped hidden units and longer steps, and continues a straight line.
     """
     if new_path(out).is_dir():
         raise IsADirectoryError(f"--out {out} is a folder: name a JSON file")
@@ -152,12 +162,12 @@ def check(
 def report(
     results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a results.json")],
     into: Annotated[
-        Path | None, tyro.conf.arg(help="rewrite the places of these results in a Markdown page")
+        Path | None, tyro.conf.arg(help="rewrite the sections of these results in a Markdown page")
     ] = None,
 ) -> None:
-    """Write the page and figures of a result file again, or its places in a Markdown page.
+    """Write the page and figures of a result file again, or its sections in a Markdown page.
 
-    Of the results of ``tipl live`` there is no page: they go into Markdown only.
+    Results of ``tipl live`` have no page; they go into a Markdown page only.
     """
     if is_live(here(results)):
         live_report(results, into)

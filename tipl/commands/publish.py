@@ -16,18 +16,20 @@ from weighttraj.terminal import say
 
 
 def release(
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="of a trained model")],
-    name: Annotated[str, tyro.conf.arg(help="in the zoo")],
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="folder of a trained model")],
+    name: Annotated[str, tyro.conf.arg(help="name of the released model")],
     results: Annotated[
-        Path | None, tyro.conf.arg(help="results.json that evaluated the model of the zoo")
+        Path | None, tyro.conf.arg(help="results.json of the evaluation of the released model")
     ] = None,
-    checks: Annotated[Path | None, tyro.conf.arg(help="what `tipl check` wrote of it")] = None,
+    checks: Annotated[
+        Path | None, tyro.conf.arg(help="file that `tipl check` wrote for it")
+    ] = None,
     rows: Annotated[
         tuple[Path, ...], tyro.conf.arg(help="rows.csv of several tasks, for the card")
     ] = (),
-    log: Annotated[bool, tyro.conf.arg(help="keep some lines of the training's log")] = True,
+    log: Annotated[bool, tyro.conf.arg(help="keep some lines of the log of the training")] = True,
 ) -> None:
-    """Put a model into the zoo: first as a draft, then with the results of its evaluation there."""
+    """Add a model to the released ones: first as a draft, then with its evaluation."""
     out = release_model(here(folder), name, results=results, checks=checks, rows=rows, log=log)
     say(f"model in {out}")
     if read_metrics(out) is None:
@@ -35,25 +37,25 @@ def release(
 
 
 def card(
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="a model of the zoo")],
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="a released model")],
     out: Annotated[Path, tyro.conf.arg(help="folder of the cards")] = Path("cards/models"),
 ) -> None:
-    """Write the card of a model, or the figures of its metrics.json into the existing card."""
+    """Write the card of a model; in an existing card, replace only the figures."""
     say(f"card in {write_card(name, new_path(out))}")
 
 
 def push(
     model: Annotated[
-        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, or a model of the zoo")
+        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, or a released model")
     ],
     address: Annotated[
         tyro.conf.Positional[str], tyro.conf.arg(help="hf://organisation/name, or s3://bucket/name")
     ],
     private: Annotated[
-        bool, tyro.conf.arg(help="of a new repository: only its organisation sees it")
+        bool, tyro.conf.arg(help="make a new repository on the hub private")
     ] = False,
     card: Annotated[
-        Path | None, tyro.conf.arg(help="its card; one of the zoo brings its own")
+        Path | None, tyro.conf.arg(help="file of its card; a released model has one")
     ] = None,
 ) -> None:
     """Publish a model with its card, on the Hugging Face hub or in an object store."""

@@ -52,7 +52,7 @@ class LoopConfig:
     """Whether to compile the network with torch.compile: needs a C++ compiler, and Triton for
     cuda."""
     threads: int = 1
-    """Number of CPU threads of each process. More help on idle cores only."""
+    """Number of CPU threads of each process. More threads help only on idle cores."""
 
     def check(self) -> None:
         """Refuse numbers that make no training.

@@ -62,9 +62,9 @@ class StartsConfig:
     """Data sets: paths or ids. The training split of each is trained on, in equal shares; the
     runs of the validation split choose which state is kept."""
     out: Path
-    """Folder of the model. A training that stopped goes on from its last checkpoint."""
+    """Folder of the model. A stopped training continues from its last checkpoint."""
     starts: int = 600
-    """Number of starts of each run that are trained on, about."""
+    """Approximate number of starts of each run that are trained on."""
     training: LoopConfig
     """How the network is trained."""
     network: Any
