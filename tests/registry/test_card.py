@@ -104,7 +104,7 @@ def test_a_data_set_of_which_little_is_said(tmp_path: Path) -> None:
             writer.append(np.full(3, t, np.float32), num_timesteps=t)
     wt.registry.create([tmp_path / "a.zarr"], tmp_path / "bare")
     text = write_card(tmp_path / "bare").read_text()
-    assert "while training trains them on an environment not said: 1 runs of 5 snapshots" in text
+    assert "while training trains them on an unrecorded environment: 1 runs of 5 snapshots" in text
     assert wt.verify(tmp_path / "bare") == []
 
 

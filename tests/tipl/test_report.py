@@ -12,7 +12,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from tipl.commands.evaluate import _table
+from tipl.commands.evaluate import _table, _wrapped
+from tipl.commands.train import curves
 from tipl.errors import EvaluateError
 from tipl.evaluation.results import Measure, Results, Row, read_results, write_document
 from tipl.report.figures import (
@@ -363,3 +364,24 @@ def test_a_strangers_result_file_adds_no_markup_to_a_page(
     assert "\n# head" not in said
     assert "\x1b" not in said
     assert said.count("|---|") == plain.count("|---|")
+
+
+# The terminal
+
+
+def test_wrapped_sentences_break_no_figure(demo: dict[str, Any]) -> None:
+    for sentence in sentences(typed(demo)):
+        for width in (30, 40, 79, 80):
+            lines = _wrapped(sentence, width).split("\n")
+            assert max(map(len, lines)) <= width
+            assert " ".join(line[2:] for line in lines) == sentence
+            assert not any(line.endswith("=") or line.lstrip().startswith("=") for line in lines)
+
+
+def test_a_curve_has_a_bar_for_each_line_of_the_log() -> None:
+    log = [{"batch": 50.0 * n, "wpe": 10.0**-n} for n in range(1, 9)]
+    log[0]["validation_wpe"] = 1.0  # one value is no curve
+    (line,) = curves(log)
+    assert line == "WPE on training runs █▇▆▅▄▃▂▁ 0.1 at batch 50, 1e-08 at batch 400"
+    assert len(curves([line | {"validation_wpe": 1.0} for line in log])) == 2
+    assert curves([]) == []

@@ -326,7 +326,7 @@ def test_a_card_keeps_its_prose(
     card = write_card("tipl-small", tmp_path / "cards")
     text = card.read_text()
     assert text.startswith("---\nlicense: mit\n")
-    assert "## What is ours" in text
+    assert "## Our choices" in text
     assert 'datasets:\n- "small"\n' in text
     assert {place.section for place in places(text) if not place.empty} == {
         "summary",

@@ -54,7 +54,7 @@ class EvaluateCommand(EvaluateConfig):
     workers: int = 1
     """Number of processes; each has one thread and takes a run at a time."""
     scheduler: str | None = None
-    """Address of a Dask cluster, tcp://host:port, or `local` for one with --workers processes here."""
+    """Address of a Dask cluster, tcp://host:port, or `local` for --workers processes here."""
     imports: Annotated[tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE ...")] = ()
     """Modules that register environments (my_envs for my_envs.py); each worker imports them."""
 

@@ -27,8 +27,8 @@ from tipl.errors import ModelError
 from tipl.report.figures import svg
 from tipl.report.markdown import code, rewrite, section_of, table_lines, templates
 from tipl.report.scores import PERSISTENCE, oracles, row_at, wpe
+from tipl.report.sentences import findings
 from tipl.report.tables import cell, headline, label
-from tipl.report.verdict import verdict
 from tipl.zoo.metrics import Metrics, read_metrics
 
 _TESTS = {
@@ -117,7 +117,7 @@ def facts(metrics: Metrics, section: str) -> str:
         "measured": _measured,
         "cell": cell,
         "table_lines": table_lines,
-        "verdict": verdict,
+        "findings": findings,
     }
     return section_of("facts.md", section, context)
 

@@ -70,7 +70,7 @@ def facts(source: Source) -> Facts:
     runs = source.runs
     found: Facts = [
         ("environment", environment_of(runs)),
-        ("algorithm", _values(runs, lambda r: _algorithm(r) or "not said")),
+        ("algorithm", _values(runs, lambda r: _algorithm(r) or "not recorded")),
         ("runs", _runs(source)),
         ("snapshots", _snapshots(runs)),
         ("parameters", _values(runs, lambda r: f"{r.layout.size:,}") + " in each snapshot"),
@@ -124,7 +124,7 @@ def lead(source: Source) -> str:
 
 def environment_of(runs: Iterable[Run]) -> str:
     """Return ids of the environments."""
-    return _values(runs, lambda r: r.info.env.id if r.info.env else "not said")
+    return _values(runs, lambda r: r.info.env.id if r.info.env else "not recorded")
 
 
 def number(value: float) -> str:
@@ -178,7 +178,7 @@ def _snapshots(runs: Iterable[Run]) -> str:
 
 def _cadence(run: Run) -> str:
     cadence = run.info.cadence
-    return f"every {cadence.every} gradient steps" if cadence else "at times that are not said"
+    return f"every {cadence.every} gradient steps" if cadence else "at unrecorded times"
 
 
 def _status(source: Source) -> str:

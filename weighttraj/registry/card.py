@@ -196,7 +196,7 @@ def _front_matter(dataset: Dataset) -> str:
 
 def _summary(dataset: Dataset) -> str:
     run = dataset.runs[0]
-    env = sorted({r.info.env.id for r in dataset if r.info.env}) or ["an environment not said"]
+    env = sorted({r.info.env.id for r in dataset if r.info.env}) or ["an unrecorded environment"]
     names = sorted({r.info.algorithm.name for r in dataset if r.info.algorithm}) or ["training"]
     cadence = run.info.cadence
     every = f", one every {cadence.every} gradient steps" if cadence else ""
@@ -266,7 +266,7 @@ def _collection(dataset: Dataset) -> str:
     lines = []
     for packages in sorted(provenances):
         said = ", ".join(f"{name} {version}" for name, version in json.loads(packages).items())
-        lines.append(f"- made with {markdown(said) or 'versions that are not said'}")
+        lines.append(f"- made with {markdown(said) or 'versions that are not recorded'}")
     provenance = run.info.provenance
     machine = ", ".join(filter(None, (provenance.platform, provenance.cpu)))
     if machine:
