@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import torch
@@ -30,7 +29,6 @@ from tipl.errors import EvaluateError
 from tipl.evaluation import measure
 from tipl.evaluation.leaderboard import leaderboard
 from tipl.evaluation.parts import Parts
-from tipl.evaluation.results import Results
 from tipl.evaluation.rows import read_rows
 from tipl.evaluation.starts import (
     Starts,
@@ -43,7 +41,6 @@ from tipl.evaluation.starts import (
 from tipl.evaluation.statistics import Bootstrap, interquartile_mean, mean, ratio_of_sums
 from tipl.evaluation.summary import Summary
 from tipl.evaluation.weights import squared_errors
-from tipl.report.verdict import verdict
 from tipl.saved import fingerprint
 from weighttraj.collect import collect
 from weighttraj.collect.settings import Seeds
@@ -378,38 +375,6 @@ def test_the_page_stands_alone_and_says_who_wins(
     pictures = list(config.out.glob("*.png"))
     assert len(pictures) == 5
     assert all(picture.stat().st_size > 10_000 for picture in pictures)
-
-
-@pytest.mark.parametrize(
-    ("skills", "said"),
-    [
-        ((0.1, 0.2), "beats persistence"),
-        ((-1, -2), "loses to persistence"),
-        ((0.1, -1), "splits with persistence"),
-        ((0.0, 0.0), "does not clearly differ from persistence"),
-        ((-1, 0.0), "loses to persistence"),
-        ((0.2, 0.0), "beats persistence"),
-    ],
-)
-def test_the_verdict_is_plain(skills: tuple[float, float], said: str) -> None:
-    def scores(rows: list[dict[str, Any]], repw: float) -> dict[str, Any]:
-        gaps = [{"h": 1, "value": repw, "low": None, "high": None}]
-        skill = {"ratio_of_sums": {"all": rows}}
-        return {
-            "causal": False,
-            "skill": skill,
-            "repw": {"sampled": {"learning": gaps}},
-        }
-
-    rows = [
-        {"h": h, "value": v, "low": None, "high": None}
-        for h, v in zip((1, 10), skills, strict=True)
-    ]
-    forecasters = {"persistence": scores(rows, 2.0), "tipl": scores(rows, 3.0)}
-    document = json.loads((ROOT / "tests/tipl/results.json").read_text())
-    text = verdict(msgspec.convert(document | {"forecasters": forecasters}, Results))
-    assert f"TIPL {said}" in text
-    assert "1.5 times that of persistence" in text
 
 
 # Bad input

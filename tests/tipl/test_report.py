@@ -15,7 +15,7 @@ import pytest
 from tipl.commands.evaluate import _table, _wrapped
 from tipl.commands.train import curves
 from tipl.errors import EvaluateError
-from tipl.evaluation.results import Measure, Results, Row, read_results, write_document
+from tipl.evaluation.results import Results, Row, read_results, write_document
 from tipl.report.figures import (
     OTHERS,
     figures,
@@ -30,13 +30,12 @@ from tipl.report.page import write_report
 from tipl.report.scores import GAIN, SKILL, row_at, shown
 from tipl.report.sentences import findings, sentences
 from tipl.report.tables import cell, tables
-from tipl.report.verdict import paragraphs, verdict
 from weighttraj.errors import FormatError
 from weighttraj.terminal import Output
 
 ROOT = Path(__file__).parents[2]
 DEMO = Path("tests/tipl/results.json")
-SECTIONS = ("overview", "table", "findings", "verdict", "tables", "figures", "source")
+SECTIONS = ("overview", "table", "findings", "tables", "figures", "source")
 
 
 @pytest.fixture
@@ -50,11 +49,6 @@ def demo() -> dict[str, Any]:
 
 def typed(document: dict[str, Any]) -> Results:
     return msgspec.convert(document, Results)
-
-
-def told(document: dict[str, Any], measure: Measure, h: int) -> str:
-    """A figure of TIPL as text."""
-    return cell(row_at(typed(document).forecasters["tipl"], measure, h))
 
 
 @pytest.mark.parametrize("width", [80, 100, 250])
@@ -148,7 +142,7 @@ def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
     assert titles(typed(demo | {"modes": []})) == ["Skill against horizon"]
 
 
-# The verdict
+# The sentences
 
 
 def test_sentences_say_what_was_done_found_and_how_sure_it_is(many: dict[str, Any]) -> None:
@@ -170,6 +164,39 @@ def test_sentences_say_what_was_done_found_and_how_sure_it_is(many: dict[str, An
     assert last.startswith("This is a quick evaluation")
 
 
+def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> None:
+    for scores in demo["forecasters"].values():
+        for key in ("repw", "gain", "scatter"):
+            del scores[key]
+    (said,) = findings(typed(demo | {"modes": []}))
+    assert said.endswith(" at h = 10.")
+    assert "gain" not in said
+
+
+@pytest.mark.parametrize(
+    ("skills", "said"),
+    [
+        ((0.1, 0.2), "TIPL removes 10 % of the error of persistence at h = 1 and 20 % at h = 10."),
+        ((-1, -2), "TIPL has 2 times the error of persistence at h = 1 and 3 times at h = 10."),
+        (
+            (0.1, -1),
+            "TIPL removes 10 % of the error of persistence at h = 1 and has 2 times the error of "
+            "persistence at h = 10.",
+        ),
+        (
+            (0.0, 0.2),
+            "TIPL has about the error of persistence at h = 1 and removes 20 % of the error of "
+            "persistence at h = 10.",
+        ),
+    ],
+)
+def test_a_finding_is_plain(demo: dict[str, Any], skills: tuple[float, float], said: str) -> None:
+    rows = [{"h": h, "value": v} for h, v in zip((1, 10), skills, strict=True)]
+    scores = {"causal": True, "skill": {"ratio_of_sums": {"all": rows}}}
+    forecasters = {"persistence": scores, "tipl": scores}
+    assert findings(typed(demo | {"forecasters": forecasters})) == [said]
+
+
 def test_sentences_about_baselines_alone_or_one_run(demo: dict[str, Any]) -> None:
     alone = {"persistence": demo["forecasters"]["persistence"]}
     alone["ema-0.9"] = shifted(alone["persistence"], 0.005)
@@ -179,51 +206,6 @@ def test_sentences_about_baselines_alone_or_one_run(demo: dict[str, Any]) -> Non
     assert "ema-0.9 has about the error of persistence at h = 1 and" in finding
     assert findings(one) == [finding]
     assert last.endswith("with one run there are no intervals.")
-
-
-def test_the_verdict_answers_in_weights_in_return_and_in_gain(many: dict[str, Any]) -> None:
-    first, second, rivals = paragraphs(typed(many))
-    assert first.startswith("In weight error, TIPL loses to persistence on 10 runs")
-    assert f"{told(many, SKILL, 10)} at h = 10" in first
-    assert f"{told(many, GAIN, 50)} at h = 50" in first
-    assert "tipl-2 beats persistence on 10 runs that it was not trained on" in second
-    assert "0.50 [0.49, 0.51] at h = 200" in second
-    assert "0.50 [0.40, 0.60] times that of persistence with sampled actions (better)" in second
-    assert rivals == (
-        "Best of 20 baselines: in weight error at h = 1, base-19, 0.19 [0.18, 0.20]; "
-        "in weight error at h = 10, base-19, 0.19 [0.18, 0.20]; "
-        "in inference gain at h = 50, base-0, 0.00 [-0.01, 0.01]."
-    )
-
-
-def test_an_old_file_has_the_ratio_without_an_interval(demo: dict[str, Any]) -> None:
-    sums = [
-        sum(row["value"] for row in scores["repw"]["sampled"]["learning"] if row["h"] <= 10)
-        for name, scores in demo["forecasters"].items()
-        if name in ("tipl", "persistence")
-    ]
-    assert f"is {sums[1] / sums[0]:.3g} times that of persistence with sampled actions," in verdict(
-        typed(demo)
-    )
-
-
-def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> None:
-    for scores in demo["forecasters"].values():
-        for key in ("repw", "gain", "scatter"):
-            del scores[key]
-    demo["modes"], demo["split"] = [], "train"
-    (said,) = paragraphs(typed(demo))
-    assert "on 10 runs that it may have been trained on" in said
-    assert said.endswith(f"{told(demo, SKILL, 200)} at h = 200.")
-
-
-def test_split_verdicts_say_where(many: dict[str, Any]) -> None:
-    rows = many["forecasters"]["tipl-2"]["skill"]["ratio_of_sums"]["all"]
-    rows[0] |= {"value": -0.3, "low": -0.4, "high": -0.2}
-    said = paragraphs(typed(many))[1]
-    assert "tipl-2 splits with persistence" in said
-    assert said.split(" It is ")[1].startswith("better at h = 2, 3,")
-    assert "100, 200, worse at h = 1. In return" in said
 
 
 @pytest.mark.parametrize(
@@ -246,7 +228,7 @@ def page_of(*sections: str, source: Path = DEMO) -> str:
 
 def test_every_section_is_written_in_its_place(demo: dict[str, Any], tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    other = page_of("verdict", source=Path("other.json"))
+    other = page_of("findings", source=Path("other.json"))
     page.write_text(page_of(*SECTIONS) + other)
     assert all(place.empty for place in places(page.read_text()))
     insert_markdown(typed(demo), DEMO, page)
@@ -301,7 +283,7 @@ def test_the_source_says_how_it_was_judged(demo: dict[str, Any]) -> None:
 def test_a_page_without_a_place_is_refused(demo: dict[str, Any], tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     unclosed = f"<!-- results of {DEMO} -->\n"
-    for text in ("# Nothing\n", page_of("verdict", source=Path("other.json")), unclosed):
+    for text in ("# Nothing\n", page_of("findings", source=Path("other.json")), unclosed):
         page.write_text(text)
         with pytest.raises(EvaluateError, match="no place for these results"):
             insert_markdown(typed(demo), DEMO, page)

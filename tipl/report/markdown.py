@@ -7,10 +7,9 @@ same way, with another word for *results*.
 
 | section | what it shows |
 |---|---|
-| ``overview`` | skill and gain without intervals, and the verdict in plain sentences |
+| ``overview`` | skill and gain without intervals, and the result in plain sentences |
 | ``table`` | the table of the overview |
 | ``findings`` | one sentence for each model, and one about the best baselines |
-| ``verdict`` | the sentences only |
 | ``tables`` | all tables, the less important ones folded |
 | ``figures`` | pictures, which lie in a folder beside the page, named after the result file |
 | ``source`` | data, runs, starts and the command that made the results |
@@ -31,11 +30,10 @@ from tipl.evaluation.results import Results
 from tipl.report.figures import figures, file_name, png, titles
 from tipl.report.sentences import findings, sentences
 from tipl.report.tables import Table, cell, compact, label, tables
-from tipl.report.verdict import paragraphs
 from weighttraj import text
 from weighttraj.atomic import replace_file
 
-SECTIONS = ("overview", "table", "findings", "verdict", "tables", "figures", "source")
+SECTIONS = ("overview", "table", "findings", "tables", "figures", "source")
 DPI = 110
 """Resolution of pictures in Markdown pages."""
 
@@ -129,7 +127,6 @@ def render(results: Results, source: Path, section: str) -> str:
         "compact": compact,
         "findings_of": findings,
         "sentences": sentences,
-        "paragraphs": paragraphs,
         "table_lines": table_lines,
         "titles": titles,
     }
