@@ -223,7 +223,9 @@ def _name_those_outside(axes: Axes) -> None:
     for names, y, where, va in ((below, 0.02, "below", "bottom"), (above, 0.98, "above", "top")):
         if names:
             text = "\n".join([f"{where} the frame:", *names])
-            axes.text(0.02, y, text, transform=axes.transAxes, fontsize=7, va=va, zorder=5)
+            box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1}
+            at = axes.transAxes
+            axes.text(0.02, y, text, transform=at, fontsize=7, va=va, bbox=box, zorder=5)
 
 
 def _label(axes: Axes, x: str, y: str) -> None:
