@@ -56,7 +56,7 @@ TASKS = {
 LADDER_TASKS = tuple(task for task in TASKS if TASKS[task] in LADDER)
 """Tasks of the ladder from TIPL to tipl-gate."""
 SEEDS = (0, 1, 2)
-TUNED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase", "relex-50")
+TUNED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase")
 """Forecasts that are stretched by what the returns of validation runs say, all with one grid."""
 AMPLITUDES = "0.125 0.25 0.5 1 2 4"
 LEARNED = (
