@@ -220,8 +220,11 @@ def _made_by(runs: Sequence[wt.Run]) -> str:
     cpus = sorted({p.cpu for p in provenances})
     versions = {tuple(sorted(p.packages.items())) for p in provenances}
     told = ("; or ").join(", ".join(" ".join(pair) for pair in each) for each in sorted(versions))
-    trainer = getattr(algorithm, "library", "")
-    return f"{trainer} on {' and '.join(cpus)}, with {told}"
+    trainer, _, same = getattr(algorithm, "library", "").partition(", as ")
+    trainer = trainer.removesuffix("'s population")
+    if same:
+        trainer = f"{trainer}'s population collector (the algorithm of {same})"
+    return f"{trainer} on {' and '.join(cpus)}; versions: {told}"
 
 
 def _final(runs: Sequence[wt.Run], kind: Kind) -> Interval | None:
@@ -315,11 +318,11 @@ def _contents(recipe: Recipe, facts: Facts) -> Iterator[str]:
         f"- Each run has {recipe.n_snapshots:,} snapshots of {parameters_of(recipe):,} "
         f"parameters, one every {recipe.store.every} gradient steps, over {facts.steps:,} "
         "environment steps. Each snapshot has its observation and reward normalisers, counters and "
-        f"diagnostics; each iteration {recipe.store.probe_observations} of the observations that "
-        "the network saw."
+        f"diagnostics. For each iteration, {recipe.store.probe_observations} observations of its "
+        "rollout are stored, as the network saw them (probe observations)."
     )
     yield f"- {_evaluation(facts.evaluated)}"
-    yield f"- Made by {facts.made_by}."
+    yield f"- Trained by {facts.made_by}."
     if recipe.seeds.test:
         yield "- Evaluate forecasts on the `test` runs; make choices on the `validation` runs."
 
@@ -449,7 +452,7 @@ def table() -> str:
             f"{sum(here.runs.values()) if here else 0} / {len(recipe.splits())}",
             f"{recipe.n_snapshots:,}",
             _size(here.megabytes) if here else "-",
-            _interval(final) if final else "-",
+            _interval(final) if final else "not measured",
             f"![curves of {recipe.id}]({recipe.id}/curves.svg)" if facts else "-",
         ]
         lines.append("| " + " | ".join(cells) + " |")
@@ -463,18 +466,16 @@ def insert(page: str) -> str:
 
 def short_table() -> str:
     """Return the data sets whose runs are in this repository, in few columns."""
-    lines = ["| data set | task | runs | snapshots of each | MB | return at the end |"]
-    lines.append("|---|---|---:|---:|---:|---:|")
+    lines = ["| data set | runs | snapshots of each | return at the end |"]
+    lines.append("|---|---:|---:|---:|")
     for recipe in recipes():
         facts = facts_of(recipe.id)
         if facts is None or facts.here is None:
             continue
         cells = [
             f"[{recipe.id}](datasets/{recipe.id}/README.md)",
-            recipe.ppo.env_id,
             f"{sum(facts.here.runs.values())}",
             f"{recipe.n_snapshots:,}",
-            f"{facts.here.megabytes:.0f}",
             _number(next(iter(facts.final.values())).mean) if facts.final else "-",
         ]
         lines.append("| " + " | ".join(cells) + " |")

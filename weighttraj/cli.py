@@ -17,6 +17,7 @@ import weighttraj as wt
 from weighttraj import registry
 from weighttraj.errors import RegistryError, WeightTrajError
 from weighttraj.locate import COLLECTED, clone, locate
+from weighttraj.overview import status_of
 from weighttraj.plugins import import_modules
 from weighttraj.remote import RemotePath, here, is_remote
 from weighttraj.terminal import Output, say, while_read
@@ -174,7 +175,7 @@ def _list() -> None:
     for dataset in registry.local_datasets():
         try:
             info = dataset.info
-            said = [info.status, info.part or str(len(info.runs))]
+            said = [status_of(info), info.part or str(len(info.runs))]
         except WeightTrajError as error:
             said = [f"damaged: {error.message.splitlines()[0]}", "-"]
         table.add_row(*map(escape, [dataset.id, *said, f"{dataset.size / 1e6:.1f}"]))
@@ -220,7 +221,7 @@ def _text(value: object) -> str:
 @app.command(name="create")
 def _create(
     out: Positional[Path],
-    runs: Positional[tuple[Path, ...]],
+    runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN ...]")],
     split: tuple[str, ...] = (),
     version: str = "1",
     licence: str = "CC-BY-4.0",
@@ -249,7 +250,10 @@ def _create(
 
 
 @app.command(name="combine")
-def _combine(paths: Positional[tuple[str, ...]], out: Path) -> None:
+def _combine(
+    paths: Annotated[Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATASET [DATASET ...]")],
+    out: Path,
+) -> None:
     """Join the runs of several data sets in a new one; the old ones stay.
 
     Args:

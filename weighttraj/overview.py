@@ -45,7 +45,12 @@ def as_html(dataset: _Runs) -> str:
 
 
 def _title(info: DatasetInfo) -> str:
-    return f"{info.id}, version {info.version}, {info.status}"
+    return f"{info.id}, version {info.version}, {status_of(info)}"
+
+
+def status_of(info: DatasetInfo) -> str:
+    """Return the status; a complete data set that holds some runs of another is a complete part."""
+    return "complete part" if info.part and info.status == "complete" else info.status
 
 
 def _rows(dataset: _Runs) -> list[Row]:
@@ -60,7 +65,7 @@ def _rows(dataset: _Runs) -> list[Row]:
 def _runs(dataset: _Runs) -> str:
     counts = Counter(run.split or "in no split" for run in dataset.runs)
     splits = ", ".join(f"{count} {split}" for split, count in counts.items())
-    part = f"; {dataset.info.part} runs of the whole" if dataset.info.part else ""
+    part = f"; a part: {dataset.info.part} runs of the whole" if dataset.info.part else ""
     return f"{len(dataset.runs)} runs{f': {splits}' if splits else ''}{part}"
 
 

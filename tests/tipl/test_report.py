@@ -146,22 +146,41 @@ def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
 
 
 def test_sentences_say_what_was_done_found_and_how_sure_it_is(many: dict[str, Any]) -> None:
-    first, tipl, second, rivals, bound, last = sentences(typed(many))
+    first, tipl, second, weights, returns, bound, last = sentences(typed(many))
     assert first.startswith("The models forecast the weights of 10 runs that they were not")
-    error = 1 - (row_at(typed(many).forecasters["tipl"], SKILL, 10) or Row(h=10, value=0)).value
-    assert f"{error:.0f} times [" in tipl
-    assert "TIPL, which uses the future of the run, has " in tipl
+    assert "gain is the share of the return" in first
+    far = row_at(typed(many).forecasters["tipl"], SKILL, 10)
+    assert tipl.startswith("TIPL, which uses the future of the run, has skill ")
+    assert f" and {cell(far)} at h = 10; its gain is " in tipl
     assert second == (
-        "tipl-2 removes 50 % [49, 51] of the error of persistence at h = 1 and 50 % [49, 51] at "
-        "h = 10; its policies gain 50 % [49, 51] of the return that training "
-        "gains in 50 snapshots."
+        "tipl-2 has skill 0.50 [0.49, 0.51] at h = 1 and 0.50 [0.49, 0.51] at h = 10; its gain is "
+        "0.50 [0.49, 0.51] at h = 50."
     )
-    assert rivals.startswith(
-        "The best of 20 baselines are: in weight error, base-19, which removes"
+    assert weights.startswith("base-19 has the highest skill of 20 baselines: ")
+    assert returns == (
+        "base-0 has the highest gain of these baselines: 0.00 [-0.01, 0.01] at h = 50."
     )
-    assert "in return, base-0, which gains 0 % [-1, 1] at h = 50" in rivals
-    assert bound.startswith("reconstruction (oracle), rank 32 is a bound and not a forecast")
+    assert bound.startswith("reconstruction (oracle), rank 32 is not a forecast")
     assert last.startswith("This is a quick evaluation")
+
+
+@pytest.mark.parametrize(
+    ("name", "shift", "said"),
+    [
+        ("base", 0.495, "these runs do not show which one gains more."),
+        ("base-further", 0.495, "most of the gain comes from the longer step."),
+        ("base-further", 0.2, None),
+    ],
+)
+def test_a_baseline_that_gains_as_much_is_named(
+    many: dict[str, Any], name: str, shift: float, said: str | None
+) -> None:
+    others = many["forecasters"]
+    found = findings(
+        typed(many | {"forecasters": others | {name: shifted(others["persistence"], shift)}})
+    )
+    both = [sentence for sentence in found if "overlap" in sentence]
+    assert both == ([f"The intervals of tipl-2 and {name} overlap: {said}"] if said else [])
 
 
 def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> None:
@@ -176,18 +195,8 @@ def test_results_without_returns_speak_of_weights_only(demo: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("skills", "said"),
     [
-        ((0.1, 0.2), "TIPL removes 10 % of the error of persistence at h = 1 and 20 % at h = 10."),
-        ((-1, -2), "TIPL has 2 times the error of persistence at h = 1 and 3 times at h = 10."),
-        (
-            (0.1, -1),
-            "TIPL removes 10 % of the error of persistence at h = 1 and has 2 times the error of "
-            "persistence at h = 10.",
-        ),
-        (
-            (0.0, 0.2),
-            "TIPL has about the error of persistence at h = 1 and removes 20 % of the error of "
-            "persistence at h = 10.",
-        ),
+        ((0.1, 0.2), "TIPL has skill 0.10 at h = 1 and 0.20 at h = 10."),
+        ((-1, -2.5), "TIPL has skill -1.00 at h = 1 and -2.50 at h = 10."),
     ],
 )
 def test_a_finding_is_plain(demo: dict[str, Any], skills: tuple[float, float], said: str) -> None:
@@ -203,7 +212,7 @@ def test_sentences_about_baselines_alone_or_one_run(demo: dict[str, Any]) -> Non
     one = typed(demo | {"forecasters": alone, "runs": ["seed0040"], "split": "train"})
     first, finding, last = sentences(one)
     assert first.startswith("The baselines forecast the weights of 1 run that they may have been")
-    assert "ema-0.9 has about the error of persistence at h = 1 and" in finding
+    assert finding.startswith("ema-0.9 has skill ")
     assert findings(one) == [finding]
     assert last.endswith("with one run there are no intervals.")
 

@@ -355,7 +355,7 @@ def test_what_was_not_measured_leaves_no_heading(
     metrics = metrics_of("tipl-small")
     assert facts(metrics, "checks") == ""
     text = write_card("tipl-small", tmp_path / "cards").read_text()
-    assert "Five checks" not in text
+    assert "Six checks" not in text
     assert not list((tmp_path / "cards").glob("*.svg"))
     assert "![" not in text
 
@@ -383,6 +383,19 @@ def test_the_card_of_amplitudes_shows_what_chose_them(
     assert gate == "tipl train gate --data small --out GATE --width 16 --horizons 1 5"
     assert drift == "tipl train scaled --along GATE --data small --out FOLDER --episodes 3"
     assert judged == metrics.results.command
+
+
+def test_the_commands_make_the_baselines_first(trained: Path, zoo: Path, results: Path) -> None:
+    release(trained, "tipl-small", results=results)
+    metrics = metrics_of("tipl-small")
+    command = (
+        "tipl evaluate tipl-small ema-0.9 a/persistence a/ema-0.9 b/ema-0.9-further --data small"
+    )
+    found = replace(metrics, results=msgspec.structs.replace(metrics.results, command=command))
+    *_, first, second, judged, _ = facts(found, "commands").splitlines()
+    assert first == "tipl train baselines --data small --out a"
+    assert second == "tipl train scaled --along a/ema-0.9 --data small --out b/ema-0.9-further"
+    assert judged == command
 
 
 def test_cards_refuse_what_they_cannot_say(
@@ -430,8 +443,8 @@ def test_the_commands_go_all_the_way(
     assert "card in cards/models/tipl-a.md" in call("card", "tipl-a")
     text = Path("cards/models/tipl-a.md").read_text()
     assert "tipl evaluate tipl-a" in text
-    assert "| a straight line | its basis needs more directions | no |" in text
-    assert "| the future moves no bit | other bits | no |" in text
+    assert "continues it | its basis needs more directions | no |" in text
+    assert "the same forecast, bit for bit | other bits | no |" in text
 
 
 def test_a_gate_is_released_with_its_data_sets(

@@ -1,9 +1,11 @@
-"""Five tests that a causal forecaster should pass, as numbers.
+"""Six checks that a causal forecaster should pass, as numbers.
 
 - *null*: fitted to random walks and evaluated on others, its skill is 0 at every horizon.
 - *causality*: what comes after t changes no bit of the forecast from t.
-- *equivariance*: a policy with its hidden units in another order, or with the signs around tanh
-  units flipped, is the same policy; the forecast follows.
+- *permutation*: a policy with its hidden units in another order is the same policy; the forecast
+  is permuted in the same way.
+- *sign*: a policy with the signs around tanh units flipped is the same policy; the forecast is
+  flipped in the same way.
 - *scale*: steps c times as long give a displacement c times as long.
 - *drift*: a run on a straight line is forecast exactly. Only trends must pass this one: a fit to
   runs that do not move on lines shrinks every step.
@@ -51,7 +53,7 @@ def check(
     count: int = 4,
     seed: int = 0,
 ) -> Checks:
-    """Run all five checks.
+    """Run all six checks.
 
     Args:
         forecaster: what is checked, fitted to real runs.

@@ -1,4 +1,4 @@
-"""Runs the five checks on any forecaster, with a fit of its kind to random walks for the null.
+"""Runs the six checks on any forecaster, with a fit of its kind to random walks for the null.
 
 A forecaster that was fitted to real runs does not show what its kind finds in random walks. So a
 new one, of the same kind and sizes, is fitted to walks. The registry says how; a kind without a
@@ -42,7 +42,7 @@ def check_model(
     walks: int = 12,
     seed: int = 0,
 ) -> CheckResults:
-    """Run the five checks on copies of the first test run of a data set, as ``tipl check`` does.
+    """Run the six checks on copies of the first test run of a data set, as ``tipl check`` does.
 
     The other arguments are described in ``CheckResults``.
 

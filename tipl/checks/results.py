@@ -1,4 +1,4 @@
-"""What the five checks find, and the file that ``tipl check`` writes. Imports no torch."""
+"""What the six checks find, and the file that ``tipl check`` writes. Imports no torch."""
 
 from __future__ import annotations
 

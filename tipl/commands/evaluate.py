@@ -45,12 +45,18 @@ class EvaluateCommand(EvaluateConfig):
     ``tipl leaderboard`` compares forecasters over all of them.
     """
 
-    forecasters: tyro.conf.Positional[tuple[str, ...]] = ()
+    forecasters: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[FORECASTER ...]")
+    ] = ()
     """Folders of models and of fitted baselines; names of released models, or of baselines that
     need no fit, such as ``ema-0.95``; or classes, ``module:Class``. ``{data}`` in a name stands for
     the id of the data set: ``data/results/{data}/gate``."""
-    data: tuple[str, ...]  # type: ignore[assignment]
+    data: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA ...")]  # type: ignore[assignment]
     """Data sets: paths or ids."""
+    quick: bool = False
+    """Minutes instead of hours: at most 300 starts in each run, 50 of them for divergences of
+    policies, 2 in the learning phase and 1 after it for returns, return horizons 1, 10 and 50, and
+    5 episodes."""
     workers: int = 1
     """Number of processes; each has one thread and takes a run at a time."""
     scheduler: str | None = None
@@ -107,7 +113,7 @@ def _evaluate_on(args: EvaluateCommand, data: str, out: Path) -> list[str]:
 
 def _wrapped(sentence: str, width: int) -> str:
     """Return a sentence as an item of a list; figures such as ``h = 10`` are not broken."""
-    kept = re.sub(r"h = |, (?=-?[\d.]+\])|\d (?=[%\[])|% (?=\[)|times (?=\[)", _unbroken, sentence)
+    kept = re.sub(r"h = |, (?=-?[\d.]+\])|\d (?=[%\[])", _unbroken, sentence)
     lines = wrap(kept, width, initial_indent="- ", subsequent_indent="  ")
     return "\n".join(lines).replace(NO_BREAK, " ")
 
@@ -139,10 +145,11 @@ def check(
         int, tyro.conf.arg(help="seed of the walks, the symmetries and the training")
     ] = 0,
 ) -> None:
-    """Run five tests that a causal forecaster should pass, and write what they measured.
+    """Run six checks that a causal forecaster should pass, and write what they measured.
 
-    The tests show whether it has skill on random walks, uses the future, follows permuted and
-    flipped hidden units and longer steps, and continues a straight line.
+    The checks show whether it has skill on random walks, whether it uses the future, whether it
+    follows permuted hidden units, flipped hidden units and longer steps, and whether it continues a
+    straight line.
     """
     if new_path(out).is_dir():
         raise IsADirectoryError(f"--out {out} is a folder: name a JSON file")

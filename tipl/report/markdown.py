@@ -9,7 +9,7 @@ same way, with another word for *results*.
 |---|---|
 | ``overview`` | skill and gain without intervals, and the result in plain sentences |
 | ``table`` | the table of the overview |
-| ``findings`` | one sentence for each model, and one about the best baselines |
+| ``findings`` | one sentence for each model, and some about the best baselines |
 | ``tables`` | all tables, the less important ones folded |
 | ``figures`` | pictures, which lie in a folder beside the page, named after the result file |
 | ``source`` | data, runs, starts and the command that made the results |

@@ -11,7 +11,7 @@ PERSISTENCE = "persistence"
 BEST = 3
 """Number of baselines that count as the best in weight error."""
 GAIN_HORIZON = 50
-"""Horizon at which gains are compared, or the largest one below."""
+"""Horizon at which gains are compared, or the largest one below, or else the smallest one."""
 
 
 def skill(aggregate: str = "ratio_of_sums", starts: str = "all") -> Measure:
@@ -84,7 +84,7 @@ def best(
 def gain_horizon(results: Results) -> int | None:
     """Return the horizon at which gains are compared; None: they were not measured."""
     measured = [row.h for row in GAIN(results.forecasters[PERSISTENCE])]
-    return max((h for h in measured if h <= GAIN_HORIZON), default=None)
+    return max((h for h in measured if h <= GAIN_HORIZON), default=min(measured, default=None))
 
 
 def shown(results: Results) -> list[str]:

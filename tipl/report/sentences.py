@@ -15,10 +15,12 @@ from tipl.report.scores import (
     oracles,
     row_at,
 )
-from tipl.report.tables import label
+from tipl.report.tables import cell, label
 
 NEAR = (1, 10)
-"""Horizons at which weight errors are told, where these were measured."""
+"""Horizons at which skills are told, where these were measured."""
+STRETCHED = ("-further", "-tuned")
+"""Ends of the names of baselines whose displacement is stretched by a factor, chosen by returns."""
 TOLD = 3
 """Number of the best baselines that are described where there is no model."""
 
@@ -29,7 +31,7 @@ def sentences(results: Results) -> list[str]:
 
 
 def findings(results: Results) -> list[str]:
-    """Return one sentence for each model, and one about the best baselines."""
+    """Return one sentence for each model, and some about the best baselines."""
     names = models(results) or best(results, baselines(results), SKILL, NEAR[-1], TOLD)
     return [*(_finding(results, name) for name in names), *_baselines(results)]
 
@@ -46,38 +48,30 @@ def _opening(results: Results) -> str:
         else f"that {they} not trained on"
     )
     runs = f"{len(results.runs)} runs" if len(results.runs) != 1 else "1 run"
+    gain = "; gain is the share of the return that training gains in h snapshots"
     return (
-        f"{who} the weights of {runs} {seen}, h snapshots ahead; persistence, the forecast to "
-        "beat, repeats the last weights, and errors are squared errors of the weights."
+        f"{who} the weights of {runs} {seen}, h snapshots ahead. Persistence repeats the last "
+        "weights. Skill compares squared errors of the weights: it is 1 for a perfect forecast "
+        f"and 0 for persistence{gain if gain_horizon(results) is not None else ''}."
     )
 
 
 def _finding(results: Results, name: str) -> str:
-    """Return the sentence about one forecaster: errors of weights, then the return it gains."""
+    """Return the sentence about one forecaster: skill of its weights, then the gain."""
     scores = results.forecasters[name]
     who = label(name) if scores.causal else f"{label(name)}, which uses the future of the run,"
-    said = f"{who} {' and '.join(_errors(results, name))}"
+    said = [f"{who} has skill {_skills(results, name)}"]
     h = gain_horizon(results)
     gained = None if h is None else row_at(scores, GAIN, h)
     if gained is not None and gained.value is not None:
-        said += (
-            f"; its policies gain {_percent(gained)} of the return that training gains in "
-            f"{gained.h} snapshots"
-        )
-    return f"{said}."
+        said.append(f"its gain is {cell(gained)} at h = {gained.h}")
+    return f"{'; '.join(said)}."
 
 
-def _errors(results: Results, name: str) -> Iterator[str]:
-    """Yield what each skill means; words that would be repeated are left out."""
-    before = ""
-    for h in _near(results):
-        row = row_at(results.forecasters[name], SKILL, h)
-        if row is None or row.value is None:
-            continue
-        verb, amount, of = _error(row)
-        same = verb == before and bool(amount)
-        before = verb
-        yield f"{amount} at h = {h}" if same else f"{verb} {amount}{of} at h = {h}"
+def _skills(results: Results, name: str) -> str:
+    """Return the skill at each horizon that is told: 0.50 [0.49, 0.51] at h = 1 and ..."""
+    rows = [row_at(results.forecasters[name], SKILL, h) for h in _near(results)]
+    return " and ".join(f"{cell(row)} at h = {row.h}" for row in rows if row is not None)
 
 
 def _near(results: Results) -> list[int]:
@@ -85,65 +79,48 @@ def _near(results: Results) -> list[int]:
     return [h for h in NEAR if h in measured] or measured[:1]
 
 
-def _error(row: Row) -> tuple[str, str, str]:
-    """Return the part of the error that is removed, or its multiple: verb, amount, of what."""
-    value = row.value or 0
-    low = value if row.low is None else row.low
-    high = value if row.high is None else row.high
-    error = "the error of persistence"
-    if low <= 0 <= high:
-        return "has", "", f"about {error}"
-    if value > 0:
-        return "removes", _percent(row), f" of {error}"
-    return "has", _times(row), f" {error}"
-
-
-def _percent(row: Row) -> str:
-    """Return a share with its interval: 50 % [40, 61]."""
-    text = f"{100 * (row.value or 0):.0f} %"
-    if row.low is not None and row.high is not None and row.low != row.high:
-        text += f" [{100 * row.low:.0f}, {100 * row.high:.0f}]"
-    return text
-
-
-def _times(row: Row) -> str:
-    """Return the multiple of an error, 1 - skill, with its interval: 29.3 times [24.1, 35.2]."""
-    text = f"{_digits(1 - (row.value or 0))} times"
-    if row.low is not None and row.high is not None and row.low != row.high:
-        text += f" [{_digits(1 - row.high)}, {_digits(1 - row.low)}]"
-    return text
-
-
-def _digits(value: float) -> str:
-    """Return a number with three digits."""
-    return f"{float(f'{value:.3g}'):,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
 def _baselines(results: Results) -> Iterator[str]:
     """Yield the best baselines, if there are several, in weights and in return."""
     names, h = baselines(results), gain_horizon(results)
     if len(names) < 2:
         return
-    found = [
-        f"in weight error, {label(first)}, which {' and '.join(_errors(results, first))}"
-        for first in best(results, names, SKILL, _near(results)[-1])
-    ]
+    for first in best(results, names, SKILL, _near(results)[-1]):
+        yield (
+            f"{label(first)} has the highest skill of {len(names)} baselines: "
+            f"{_skills(results, first)}."
+        )
     for first in best(results, names, GAIN, h) if h is not None else ():
         row = row_at(results.forecasters[first], GAIN, h or 0)
-        if row is not None:
-            found.append(f"in return, {label(first)}, which gains {_percent(row)} at h = {h}")
-    if found:
-        yield f"The best of {len(names)} baselines are: {'; '.join(found)}."
+        yield f"{label(first)} has the highest gain of these baselines: {cell(row)} at h = {h}."
+        yield from _compared(results, first, h or 0)
+
+
+def _compared(results: Results, baseline: str, h: int) -> Iterator[str]:
+    """Yield what it means if the best model and the best baseline cannot be told apart in gain."""
+    for model in best(results, models(results), GAIN, h):
+        one, other = (row_at(results.forecasters[name], GAIN, h) for name in (model, baseline))
+        if one is None or other is None or not _overlap(one, other):
+            continue
+        both = f"The intervals of {label(model)} and {label(baseline)} overlap"
+        if baseline.endswith(STRETCHED) and (other.value or 0) > (one.value or 0) / 2:
+            yield f"{both}: most of the gain comes from the longer step."
+        else:
+            yield f"{both}: these runs do not show which one gains more."
+
+
+def _overlap(one: Row, other: Row) -> bool:
+    """Say whether two intervals have a value in common; False if one of them is missing."""
+    if one.low is None or one.high is None or other.low is None or other.high is None:
+        return False
+    return one.low <= other.high and other.low <= one.high
 
 
 def _bound(results: Results) -> Iterator[str]:
     if found := [label(name) for name in oracles(results)]:
-        verb = (
-            "is a bound and not a forecast" if len(found) == 1 else "are bounds and not forecasts"
-        )
+        what = "is not a forecast" if len(found) == 1 else "are not forecasts"
         yield (
-            f"{' and '.join(found)} {verb}: the true weights after a round trip through as few "
-            "coefficients as TIPL writes."
+            f"{' and '.join(found)} {what}: the true weights after a round trip through as many "
+            "coefficients, the best that TIPL can reach with these; other models can be better."
         )
 
 

@@ -8,13 +8,14 @@ section has its own heading, so that what was not measured leaves no empty one.
 |---|---|
 | ``summary`` | data, cadence, runs that it was trained and evaluated on |
 | ``baselines`` | its figures beside those of persistence, the oracle and the best baselines |
-| ``checks`` | the five checks |
+| ``checks`` | the six checks |
 | ``training`` | settings and the error while it was trained |
 | ``commands`` | how the results were made |
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +28,17 @@ from tipl.errors import ModelError
 from tipl.report.figures import svg
 from tipl.report.markdown import code, rewrite, section_of, table_lines, templates
 from tipl.report.scores import PERSISTENCE, oracles, row_at, wpe
-from tipl.report.sentences import findings
+from tipl.report.sentences import STRETCHED, findings
 from tipl.report.tables import cell, headline, label
 from tipl.zoo.metrics import Metrics, read_metrics
 
 _TESTS = {
     "null": "random walks: skill is 0",
-    "causality": "the future moves no bit",
-    "permutation": "hidden units in another order",
-    "sign": "hidden units with the other sign",
-    "scale": "steps twice as long",
-    "drift": "a straight line",
+    "causality": "another future: the same forecast, bit for bit",
+    "permutation": "hidden units in another order: the forecast follows",
+    "sign": "hidden units with the other sign: the forecast follows",
+    "scale": "steps twice as long: the forecast follows",
+    "drift": "a straight line: the forecast continues it",
 }
 
 
@@ -185,7 +186,21 @@ def _commands(metrics: Metrics) -> str:
         ]
     elif metrics.trained_on and kind is not None and kind.command:
         commands.append(f"tipl train {kind.command} --data {data} --out FOLDER {given['']}")
+    commands += _fits(metrics)
     return "\n".join(["```bash", *map(code, (*commands, metrics.results.command)), "```"])
+
+
+def _fits(metrics: Metrics) -> Iterator[str]:
+    """Yield the commands that make the baselines, in the folders that the evaluation reads."""
+    words = metrics.results.command.split()
+    read = [Path(word) for word in words[2 : words.index("--data")]] if "--data" in words else []
+    data = metrics.results.data
+    ladders = [folder.parent for folder in read if folder.name == PERSISTENCE != str(folder)]
+    yield from (f"tipl train baselines --data {data} --out {ladder}" for ladder in ladders)
+    for folder in read:
+        along = folder.name.rpartition("-")[0]
+        if folder.name.endswith(STRETCHED) and ladders:
+            yield f"tipl train scaled --along {ladders[0] / along} --data {data} --out {folder}"
 
 
 def _option(setting: tuple[str, Any]) -> str:

@@ -13,7 +13,8 @@ from tipl.zoo.metrics import read_metrics
 from weighttraj import text
 from weighttraj.atomic import replace_file
 
-COLUMNS = ("skill, h = 1", "skill, h = 10", "gain, h = 50", "kB", "trained on")
+FIGURES = (("skill", SKILL, 10), ("gain", GAIN, 50), ("gain", GAIN, 100))
+COLUMNS = (*(f"{what}, h = {h}" for what, _, h in FIGURES), "kB", "trained on")
 CARDS = "cards/models"
 """Folder of the cards, beside the page."""
 
@@ -43,9 +44,9 @@ def _cells(folder: Path) -> list[str]:
     metrics = read_metrics(folder)
     size = sum(file.stat().st_size for file in folder.rglob(ARRAYS)) / 1000
     if metrics is None:
-        return ["-", "-", "-", f"{size:,.0f}", "-"]
-    wanted = ((SKILL, 1), (SKILL, 10), (GAIN, 50))
-    figures = [cell(row_at(metrics.scores, *each), interval=False) for each in wanted]
-    tasks = list(dict.fromkeys(str(trained.environment) for trained in metrics.trained_on))
-    many = f"{len(tasks)} tasks" if len(tasks) > 1 else text.markdown("".join(tasks) or "-")
+        return [*("-" for _ in FIGURES), f"{size:,.0f}", "-"]
+    rows = (row_at(metrics.scores, measure, h) for _, measure, h in FIGURES)
+    figures = [cell(row, interval=False) for row in rows]
+    names = [text.markdown(trained.data) for trained in metrics.trained_on]
+    many = f"{len(names)} data sets" if len(names) > 1 else "".join(names) or "-"
     return [*figures, f"{size:,.0f}", many]
