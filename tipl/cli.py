@@ -50,7 +50,7 @@ COMMANDS = {
     ),
     "check": Command(
         "Use",
-        "Run five tests that a causal forecaster should pass.",
+        "Run six checks that a causal forecaster should pass.",
         "tipl.commands.evaluate:check",
     ),
     "report": Command(

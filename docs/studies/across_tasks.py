@@ -167,7 +167,7 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(
         [
             *lines,
-            f"Skill (0 is a copy of phi_t, 1 the truth) at {result['starts']} starts of each test "
+            f"Skill (0 is persistence, 1 the truth) at {result['starts']} starts of each test "
             f"run: {count}. In italics: runs of tasks that the gate has not seen. The four: short "
             f"runs of {result['steps']:,} environment steps; {result['n_batches']:,} batches. The "
             "gates of one task are those of the zoo. 95 % intervals: bootstrap over runs.",

@@ -1,1 +1,1 @@
-"""Five tests that a causal forecaster should pass, as numbers."""
+"""Six checks that a causal forecaster should pass, as numbers."""
