@@ -31,7 +31,7 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	cp $(DEMO)/report/results.json datasets/demo/results.json
 	$(BIN)/tipl report datasets/demo/results.json --into README.md
 	$(BIN)/tipl report datasets/demo/results.json --into docs/quickstart.md
-	$(BIN)/tipl report docs/results/$(RELEASED).json --into README.md
+	$(BIN)/python docs/results/arbiter.py
 	$(BIN)/tipl zoo --into README.md
 	$(BIN)/python datasets/pages.py
 	$(BIN)/python examples/plot_path_and_returns.py docs/path-and-returns.png

@@ -90,7 +90,6 @@ def test_readme_shows_the_demo_the_results_and_the_models() -> None:
     assert shown == [
         ("results", "datasets/demo/results.json", "table", False),
         ("models", "zoo", "overview", False),
-        ("results", "docs/results/inverted-pendulum-v4-ppo-v1.json", "findings", False),
     ]
 
 

@@ -38,7 +38,7 @@ from weighttraj.text import between
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-PAGE = HERE.parent / "results.md"
+PAGE, README = HERE.parent / "results.md", ROOT / "README.md"
 ROWS, COST, PAPER = HERE / "rows", HERE / "cost.json", HERE / "paper.json"
 OUT = Path("data/arbiter")
 
@@ -646,8 +646,10 @@ def gain_figure(board: Board) -> Figure:
 
 
 def insert(text: str) -> str:
-    """Return the page with what the rows say."""
+    """Return a page with what the rows say, in each place that it has."""
     for name, content in page(read()).items():
+        if f"<!-- {name}: " not in text:
+            continue
         text = between(
             text, f"<!-- {name}: written by arbiter.py -->", f"<!-- end of {name} -->", content
         )
@@ -674,7 +676,8 @@ def main() -> None:
     for name, figure in figures(rows).items():
         (HERE / name).write_text(svg(figure))
     write_page(leaderboard(rows, rival=RIVAL), HERE)
-    PAGE.write_text(insert(PAGE.read_text()))
+    for path in (PAGE, README):
+        path.write_text(insert(path.read_text()))
 
 
 if __name__ == "__main__":
