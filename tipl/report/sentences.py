@@ -102,8 +102,8 @@ def _compared(results: Results, baseline: str, h: int) -> Iterator[str]:
         if one is None or other is None or not _overlap(one, other):
             continue
         yield (
-            f"The intervals of {label(model)} and {label(baseline)} overlap: these runs do not show "
-            "which one gains more."
+            f"The intervals of {label(model)} and {label(baseline)} overlap: these runs do not "
+            "show which one gains more."
         )
 
 
