@@ -451,12 +451,11 @@ def weights_table(board: Board) -> str:
 def returns_table(board: Board) -> str:
     """Return the ten best forecasters by gain at h = 50."""
     lines = [
-        "| forecaster | gain, h = 10 | h = 50 | h = 100 | skill, h = 50 | "
-        f"leads {SIMPLE}, h = 50 |",
-        "|---|---:|---:|---:|---:|---:|",
+        f"| forecaster | gain, h = 50 | gain, h = 100 | skill, h = 50 | leads {SIMPLE}, h = 50 |",
+        "|---|---:|---:|---:|---:|",
     ]
     for name in board.names("gain", 50)[:10]:
-        gains = [board.entry(name, "gain", h) for h in (10, 50, 100)]
+        gains = [board.entry(name, "gain", h) for h in (50, 100)]
         skill = board.entry(name, "skill", 50)
         _, clear, tasks = board.wins(name, "gain", 50)
         cells = [_cell(e and e.score) for e in (*gains, skill)]
