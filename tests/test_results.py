@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import shlex
 from pathlib import Path
 from types import ModuleType
@@ -14,14 +14,10 @@ from tipl.evaluation.rows import read_rows
 HERE = Path(__file__).parents[1] / "docs/results"
 
 
-@pytest.fixture(scope="module")
-def arbiter() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("arbiter", HERE / "arbiter.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def arbiter(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(HERE))
+    return importlib.import_module("arbiter")
 
 
 def test_the_page_says_what_the_rows_say(arbiter: ModuleType) -> None:
