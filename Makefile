@@ -5,7 +5,7 @@ DEMO := data/demo
 RELEASED := inverted-pendulum-v4-ppo-v1
 # The released models that the demo and the README show.
 TIPL := tipl-inverted-pendulum-v4
-GATE := tipl-gate-inverted-pendulum-v4
+GATE := tipl-gate
 # The processes that tests start share compiled code: without it each compiles both packages again.
 PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
 

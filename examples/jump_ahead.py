@@ -11,7 +11,7 @@ from tipl.live import ForecastCallback, JumpConfig
 
 TASK, STEPS = "InvertedPendulum-v4", 16 * 2048
 ahead = JumpConfig(horizon=50, schedule="falling", first=3)  # 50 snapshots: ten iterations
-jumps = ForecastCallback("tipl-gate-inverted-pendulum-v4", ahead)
+jumps = ForecastCallback("tipl-gate", ahead)
 
 for name, callbacks in {"plain PPO": [], "PPO with jumps": [jumps]}.items():
     print(name)

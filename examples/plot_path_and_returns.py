@@ -14,7 +14,7 @@ from weighttraj.policies import evaluate, load_policies
 
 STARTS, H, LAST = [20, 30, 40, 50], 50, 150  # forecasts of 50 snapshots ahead
 run = wt.open("inverted-pendulum-v4-ppo-v1").split("test").runs[0]
-model = tipl.load("tipl-gate-inverted-pendulum-v4")
+model = tipl.load("tipl-gate")
 forecasts = model.forecast(run, STARTS, [H])[:, 0]  # (start, param)
 ahead = load_policies(run, STARTS).with_weights(forecasts)  # with the normaliser of each start
 gained = evaluate(ahead, run, episodes=20, deterministic=False).returns.mean(axis=1)
