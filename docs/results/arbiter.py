@@ -295,9 +295,9 @@ class Board:
 
     def names(self, measure: str, horizon: int) -> list[str]:
         """Return the forecasters of all tasks, best first, bounds last."""
-        return [
-            e.forecaster for e in self.board.entries if (e.measure, e.horizon) == (measure, horizon)
-        ]
+        found = [e for e in self.board.entries if (e.measure, e.horizon) == (measure, horizon)]
+        most = max((e.tasks for e in found), default=0)
+        return [e.forecaster for e in found if e.tasks == most]
 
 
 def read() -> list[TaskRow]:
@@ -313,7 +313,7 @@ def page(rows: Sequence[TaskRow]) -> dict[str, str]:
         "weights": weights_table(weights),
         "returns": returns_table(returns),
         "transfer": transfer_table(weights),
-        "paper": paper_table(),
+        **({"paper": paper_table()} if PAPER.exists() else {}),
         "ladder": ladder_table(weights),
         "commands": "\n".join(["```text", *cost_lines(plan()), "```"]),
     }
