@@ -389,7 +389,7 @@ def _paper(weights: Board) -> str:
     skills = {
         name: [
             s.score.value
-            for task in LADDER_TASKS
+            for task in ladder_tasks(weights)
             if (s := weights.score(task, name, "skill", 1)) is not None
             and s.score.value is not None
         ]
@@ -397,11 +397,12 @@ def _paper(weights: Board) -> str:
     }
     means = {name: float(np.mean(values)) for name, values in skills.items() if values}
     order = [name for name in RUNGS if name in means]
+    tasks = len(skills[order[0]])
     jumps = {b: means[b] - means[a] for a, b in pairwise(order)}
     largest = max(jumps, key=lambda name: jumps[name])
     crossed = next((name for name in order if means[name] > 0), None)
     text = (
-        f"Its skill at h = 1 is {means[order[0]]:,.0f} on average over {len(LADDER_TASKS)} tasks. "
+        f"Its skill at h = 1 is {means[order[0]]:,.0f} on average over {tasks} tasks. "
         f"The largest single change is “{RUNGS[largest].lstrip('+ ')}”."
     )
     if crossed:
@@ -482,10 +483,15 @@ def transfer_table(board: Board) -> str:
 
 def ladder_table(board: Board) -> str:
     """Return the skill of each rung on the tasks of the ladder."""
-    heads = [f"{TASKS[task]}, h = {h}" for task in LADDER_TASKS for h in (1, 10)]
-    lines = ["| model | trainings | " + " | ".join(heads) + " |", "|---|" + "---:|" * 7]
+    tasks = ladder_tasks(board)
+    heads = [f"{TASKS[task]}, h = {h}" for task in tasks for h in (1, 10)]
+    lines = [
+        "| model | trainings | " + " | ".join(heads) + " |",
+        "|---|---:" + "|---:" * len(heads),
+    ]
+    lines[1] += "|"
     for name, told in RUNGS.items():
-        scores = [board.score(task, name, "skill", h) for task in LADDER_TASKS for h in (1, 10)]
+        scores = [board.score(task, name, "skill", h) for task in tasks for h in (1, 10)]
         if not any(scores):
             continue
         count = max(score.trainings for score in scores if score)
@@ -531,6 +537,12 @@ def keep_paper() -> None:
 
 def _at(rows: Sequence[Row], h: int) -> float | None:
     return next(row.value for row in rows if row.h == h)
+
+
+def ladder_tasks(board: Board) -> list[str]:
+    """Return the tasks of the ladder on which its first rung was evaluated."""
+    first = next(iter(RUNGS))
+    return [task for task in LADDER_TASKS if board.score(task, first, "skill", 1)]
 
 
 def _shown(name: str) -> str:
