@@ -22,7 +22,7 @@ include_patterns = [
     "CHANGELOG.md",
     "CONTRIBUTING.md",
 ]
-exclude_patterns = [".*", "data", "docs/_build", "dist"]
+exclude_patterns = [".*", "data", "docs/_build", "dist", "docs/results"]
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 3
