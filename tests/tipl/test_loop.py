@@ -233,6 +233,7 @@ def compile_here(**env: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.long
 def test_compiled_it_is_the_same() -> None:
     done = compile_here()
     if "cannot be compiled here" in done.stderr:
