@@ -69,12 +69,7 @@ def evaluate_only(
         episodes=config.episodes,
         seed=config.seed,
         quick=config.quick,
-        starts=StartCounts(
-            weights=sum(len(m.starts.weights) for m in measured),
-            policies=sum(len(m.function_starts) for m in measured),
-            learning=sum(len(m.starts.learning) for m in measured),
-            plateau=sum(len(m.starts.plateau) for m in measured),
-        ),
+        starts=_start_counts(measured),
         noise_floor=summary.noise() if config.learning_starts else {},
         forecasters={forecaster.name: summary.of(forecaster) for forecaster in everyone},
         command=" ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
@@ -92,6 +87,16 @@ def evaluate_only(
     write_rows(config.out / "rows.csv", rows)
     write_document(config.out / "results.json", results)
     return results
+
+
+def _start_counts(measured: Sequence[Measured]) -> StartCounts:
+    """Return how many starts all runs have together."""
+    return StartCounts(
+        weights=sum(len(m.starts.weights) for m in measured),
+        policies=sum(len(m.function_starts) for m in measured),
+        learning=sum(len(m.starts.learning) for m in measured),
+        plateau=sum(len(m.starts.plateau) for m in measured),
+    )
 
 
 def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
