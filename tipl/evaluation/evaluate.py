@@ -49,11 +49,10 @@ def evaluate_only(
         out=config.out.absolute(),  # workers of a cluster run elsewhere
     )
     tasks = [Task(path=run.path.absolute(), forecasters=everyone, config=config) for run in runs]
-    starts_of(runs[0], config)  # refuses what is too short or has no returns before the work
+    starts_of(runs[0], config)  # refuses too short runs, and runs without returns, before the work
     with engine_of(workers, scheduler, imports) as engine:
         measured = _measure(tasks, engine, console)
-    failed = {name: why for m in reversed(measured) for name, why in m.failed.items()}
-    everyone = _without_failed(everyone, failed)
+    everyone, failed = _without_failed(everyone, measured)
     summary = Summary(measured, config, everyone[0].name)
     results = Results(
         data=dataset.info.id,
@@ -121,9 +120,10 @@ def _everyone(forecasters: Sequence[Forecaster]) -> tuple[Forecaster, ...]:
 
 
 def _without_failed(
-    everyone: Sequence[Forecaster], failed: Mapping[str, str]
-) -> tuple[Forecaster, ...]:
-    """Return the forecasters that gave a forecast of every run."""
+    everyone: Sequence[Forecaster], measured: Sequence[Measured]
+) -> tuple[tuple[Forecaster, ...], dict[str, str]]:
+    """Return the forecasters that gave a forecast of every run, and why the others did not."""
+    failed = {name: why for m in reversed(measured) for name, why in m.failed.items()}
     kept = tuple(forecaster for forecaster in everyone if forecaster.name not in failed)
     if len(kept) == 1 < len(everyone):
         raise EvaluateError(
@@ -132,7 +132,7 @@ def _without_failed(
             got="; ".join(failed.values()),
             do="mend the forecasters",
         )
-    return kept
+    return kept, failed
 
 
 def _whole_runs(
