@@ -375,20 +375,20 @@ def _beaten(returns: Board) -> str:
 
 
 def _agreement(weights: Board) -> str:
-    pairs = [
-        (skill.score.value, gain.score.value)
+    found = {
+        name: (skill.score.value, gain.score.value)
         for name in weights.names("gain", 50)
         if (skill := weights.entry(name, "skill", 50)) is not None
         and (gain := weights.entry(name, "gain", 50)) is not None
         and not skill.oracle
-    ]
-    x, y = np.array(pairs, float).T
+    }
+    x, y = np.array(list(found.values()), float).T
     rank = float(np.corrcoef(x.argsort().argsort(), y.argsort().argsort())[0, 1])
-    best = max(zip(pairs, weights.names("gain", 50), strict=False))[1]
-    gains = [name for name in weights.names("gain", 50) if name.find("oracle") < 0]
+    in_weights, in_return = (max(found, key=lambda name: found[name][i]) for i in (0, 1))
     return (
-        f"The rank correlation between mean skill and mean gain at h = 50 over {len(pairs)} "
-        f"forecasters is {rank:.2f}. Best in weights is {best}, best in return is {gains[0]}."
+        f"The rank correlation between mean skill and mean gain at h = 50 over {len(found)} "
+        f"forecasters is {rank:.2f}. Best in weights is {in_weights}, best in return is "
+        f"{in_return}."
     )
 
 
