@@ -22,6 +22,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -670,9 +671,15 @@ def gain_figure(board: Board) -> Figure:
     return fig
 
 
+@cache
+def parts() -> dict[str, str]:
+    """Return the parts of the page that the rows in the repository give; computed once."""
+    return page(read())
+
+
 def insert(text: str) -> str:
     """Return a page with what the rows say, in each place that it has."""
-    for name, content in page(read()).items():
+    for name, content in parts().items():
         if f"<!-- {name}: " not in text:
             continue
         text = between(
