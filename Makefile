@@ -23,9 +23,9 @@ demo: setup ## collect a run, train TIPL for a moment, evaluate released models:
 	$(BIN)/weighttraj collect datasets/demo/recipe.toml --out $(DEMO)/live
 	$(BIN)/weighttraj returns $(DEMO)/live --every 25 --episodes 5
 	$(BIN)/weighttraj report $(DEMO)/live --out $(DEMO)/live.html
-	$(BIN)/tipl train tipl --data $(RELEASED) --out $(DEMO)/tipl --n-batches 400 --warmup 100 --save-every 50
-	@echo "These are the first 400 batches of a new TIPL. The table below shows the released one, after 100,000."
-	$(BIN)/tipl evaluate $(TIPL) $(GATE) --data $(RELEASED) --out $(DEMO)/report --quick --horizons 1 10 50 --starts 100 --workers 2
+	$(BIN)/tipl train tipl --data $(RELEASED) --out $(DEMO)/tipl --n-batches 200 --warmup 50 --save-every 25
+	@echo "These are the first 200 batches of a new TIPL. The table below shows the released one, after 100,000."
+	$(BIN)/tipl evaluate $(TIPL) $(GATE) --data $(RELEASED) --out $(DEMO)/report --quick --horizons 1 10 50 --return-horizons 10 50 --starts 100 --workers 2
 
 readme: demo ## write the numbers of the demo, the tables and the picture into the pages
 	cp $(DEMO)/report/results.json datasets/demo/results.json

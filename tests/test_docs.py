@@ -54,9 +54,9 @@ def test_install(reader: Path) -> None:
 
 def test_quickstart(reader: Path) -> None:
     shorter = {
-        "--n-batches 400 --warmup": "--n-batches 4 --warmup",
+        "--n-batches 200 --warmup": "--n-batches 4 --warmup",
         "--episodes 5": "--episodes 1",
-        "--quick --horizons 1 10 50 --starts 100 --workers 2": (
+        "--quick --horizons 1 10 50 --return-horizons 10 50 --starts 100 --workers 2": (
             f"{QUICKER} --horizons 1 10 --return-horizons 10"
         ),
         "tipl-inverted-pendulum-v4 tipl-gate": "tipl-gate",  # the README's test evaluates both
@@ -107,7 +107,7 @@ def test_train(
     """Two ranks of `torchrun` train in tests/tipl/test_distributed.py as well."""
     monkeypatch.setenv("WEIGHTTRAJ_DATASETS_PATH", str(brief_released.parent))
     shorter = {
-        "--n-batches 400 --warmup": "--n-batches 4 --warmup",
+        "--n-batches 200 --warmup": "--n-batches 4 --warmup",
         "--out data/demo/tipl-2 --n-batches 100": "--out data/demo/tipl-2 --n-batches 4",
         "--starts 100 --n-batches 100": "--starts 10 --n-batches 4",
         "--starts 100 --n-batches 400": "--starts 10 --n-batches 4",

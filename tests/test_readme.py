@@ -22,7 +22,7 @@ PAGES = [ROOT / "README.md", *sorted([*ROOT.glob("docs/*.md"), *ROOT.glob("cards
 
 def test_every_block_runs(reader: Path) -> None:
     shorter = {
-        "--quick --horizons 1 10 50 --starts 100 --workers 2": (
+        "--quick --horizons 1 10 50 --return-horizons 10 50 --starts 100 --workers 2": (
             f"{QUICKER} --horizons 1 10 --return-horizons 10"
         ),
     }

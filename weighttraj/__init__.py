@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from weighttraj.tools.verify import verify
     from weighttraj.writer import RunWriter
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Dataset",

@@ -15,9 +15,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from tipl.live.path import forecaster_of
 from tipl.live.plan import Evaluation, Trial
 from tipl.live.population import PopulationJumps
-from tipl.live.results import Cpu, Curve, write_json
+from tipl.live.results import Cpu, Curve
 from tipl.threads import threads
 from weighttraj import RunInfo
+from weighttraj.atomic import replace_file
 from weighttraj.collect.agents import find_agent
 from weighttraj.collect.describe import describe_run
 from weighttraj.collect.normalizers import find_normalizers
@@ -84,7 +85,8 @@ def make_block(block: Block, tell: Tell) -> None:
     if read_block(block) is None:
         with threads():
             made = _Training(block, tell).run()
-        write_json(block.file, made)
+        block.file.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(block.file, msgspec.json.encode(made) + b"\n")
 
 
 class _Training:
@@ -158,7 +160,7 @@ class _Training:
         for seed, row, made in zip(self._block.seeds, returns, outcomes, strict=True):
             found = [jump.outcome for jump in made]
             counts = {name: found.count(name) for name in ("accepted", "refused", "undone")}
-            values = [float(value) if np.isfinite(value) else None for value in row]
+            values = [float(f"{value:.6g}") if np.isfinite(value) else None for value in row]
             curves.append(Curve(seed=seed, returns=values, **counts))
         return Made(
             source=self._block.source,

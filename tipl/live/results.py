@@ -30,7 +30,7 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: int
     returns: list[float | None]
-    """Mean return J at each evaluation; null: a simulation became unstable."""
+    """Mean return J at each evaluation, six digits; null: a simulation became unstable."""
     accepted: int = 0
     """Number of jumps that stand."""
     refused: int = 0

@@ -42,7 +42,7 @@ FEATURES: tuple[tuple[Features, bool], ...] = (
 
 @dataclass(frozen=True, kw_only=True)
 class BaselinesConfig:
-    """One fit of the baselines; minutes on one core."""
+    """What the baselines are fitted to, and where they go."""
 
     data: str | Path
     """Data set; its training split is used. Of each small network the state that is best on its
@@ -59,6 +59,12 @@ class BaselinesConfig:
 
 def train_baselines(config: BaselinesConfig, *, console: Console | None = None) -> list[Forecaster]:
     """Fit the baselines to the training runs of a data set, and write each into a folder.
+
+    Minutes on one core.
+
+    Example: tipl train baselines --data hopper-v4-ppo-16x16-v1 --out data/baselines
+
+    Then: tipl evaluate data/baselines/ar-20-phase persistence --data hopper-v4-ppo-16x16-v1
 
     Raises:
         TrainError: the runs are too short, or a number is too small.

@@ -28,7 +28,7 @@ LOOP = LoopConfig(n_batches=4_000, batch_size=64, learning_rate=1e-3)
 
 @dataclass(frozen=True, kw_only=True)
 class CausalTrainConfig(StartsConfig):
-    """One training of tipl-causal."""
+    """What is trained on, and where the model goes."""
 
     network: CausalConfig = NETWORK
     """Sizes of the network."""
@@ -68,7 +68,12 @@ class CausalLearner(StartsLearner[CausalExamples]):
 
 
 def train_causal(config: CausalTrainConfig, *, console: Console | None = None) -> Causal:
-    """Train tipl-causal, or go on where the training stopped; load it if the training has ended.
+    """Train tipl-causal: TIPL with a Temporal SVD of the path before the forecast alone.
+
+    With the default settings it takes minutes on one core. A training that was stopped goes on with
+    the same command; one that has ended is loaded.
+
+    Example: tipl train causal --data hopper-v4-ppo-16x16-v1 --out data/my-causal
 
     Raises:
         TrainError: the data sets have no runs to train on, or different cadences; or as

@@ -28,7 +28,7 @@ LOOP = LoopConfig(n_batches=4_000, batch_size=32, learning_rate=3e-3)
 
 @dataclass(frozen=True, kw_only=True)
 class GateTrainConfig(StartsConfig):
-    """One training of tipl-gate. A start in a batch has 128 parameters."""
+    """What is trained on, and where the model goes. A start in a batch has 128 parameters."""
 
     network: GateConfig = NETWORK
     """Sizes of the network."""
@@ -68,9 +68,15 @@ class GateLearner(StartsLearner[GateExamples]):
 
 
 def train_gate(config: GateTrainConfig, *, console: Console | None = None) -> Gate:
-    """Train tipl-gate, or go on where the training stopped; load it if the training has ended.
+    """Train tipl-gate, one small network that forecasts each parameter of a policy.
 
-    The same seed gives the same model on the same machine.
+    With the default settings it takes minutes on one core. A training that was stopped goes on with
+    the same command; one that has ended is loaded. The same seed gives the same model on the same
+    machine.
+
+    Example: tipl train gate --data hopper-v4-ppo-16x16-v1 --out data/my-gate
+
+    Then: tipl evaluate data/my-gate persistence --data hopper-v4-ppo-16x16-v1
 
     Raises:
         TrainError: the data sets have no runs to train on, or different cadences; or as

@@ -42,7 +42,7 @@ MODE = "held"
 
 @dataclass(frozen=True, kw_only=True)
 class ScaledTrainConfig:
-    """One choice of amplitudes."""
+    """What is stretched, what chooses, and where the model goes."""
 
     along: str | Path
     """Forecaster to scale: the folder of a trained tipl-gate, or another forecaster by folder or
@@ -78,10 +78,13 @@ class ScaledTrainConfig:
 def train_scaled(
     config: ScaledTrainConfig, *, console: Console | None = None
 ) -> ScaledGate | Scaled:
-    """Choose an amplitude for each horizon: the one with the highest inference gain.
+    """Stretch a model's forecasts: choose for each horizon the factor that gains most return.
 
-    The gain is that of ``tipl evaluate``: how much the forecast adds to the return, as a share of
-    what training adds until then, summed over starts and runs. At equal gain the smaller one.
+    The inference gain on validation runs decides: how much the forecast adds to the return, as a
+    share of what training adds until then, summed over starts and runs. At equal gain the smaller
+    factor is taken. Policies are evaluated in the environment, which takes minutes.
+
+    Example: tipl train scaled --along tipl-gate --data hopper-v4-ppo-16x16-v1 --out data/stretched
 
     Returns:
         A ``ScaledGate`` if a tipl-gate is scaled, else a ``Scaled``.

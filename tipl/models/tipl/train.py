@@ -42,7 +42,7 @@ LOOP = LoopConfig(
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """One training of TIPL.
+    """What is trained on, and where the model goes.
 
     The paper fixes its length, 50 iterations of 10,000 batches, and the 64 windows of a batch.
     Sizes and optimizer are Decision Transformer's, on whose code the paper builds. Our choices: the
@@ -78,16 +78,20 @@ class TrainConfig:
 
 
 def train(config: TrainConfig, *, console: Console | None = None) -> TIPL:
-    """Train TIPL, or go on where the training stopped; load it if the training has ended.
+    """Train TIPL, the Transformer of the paper, on one data set.
 
-    Under `torchrun` each process takes its share of every batch. Only rounding and dropout differ,
-    which each process draws for its own windows::
+    A training of the paper's length (500,000 batches) takes half a day on one core, a first curve
+    minutes: see --n-batches. A training that was stopped goes on with the same command; one that
+    has ended is loaded.
 
-        torchrun --standalone --nproc-per-node 2 -m tipl train tipl --data DATA --out OUT
+    Example: tipl train tipl --data inverted-pendulum-v4-ppo-v1 --out data/my-tipl --n-batches 2000
 
-    Each line of the log has the mean training WPE since the line before, with dropout, and the WPE
-    one step ahead on validation runs, if there are any, without dropout. By default it does not
-    choose the model: the paper has no validation runs.
+    With two processes: torchrun --standalone --nproc-per-node 2 -m tipl train tipl --data DATA
+    --out OUT. Each process takes its share of every batch; only rounding and dropout differ.
+
+    Each line of the log has the mean WPE on training windows since the line before, with dropout,
+    and the WPE one step ahead on validation runs, if there are any, without dropout. By default the
+    latter does not choose the model, because the paper has no validation runs.
 
     Raises:
         TrainError: the data do not fit, or as ``train_network``.
