@@ -391,6 +391,8 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     results = read_live(plan.parent / "out/test/results.json")
     assert {one.arm: len(one.curves) for one in results.series} == {"ppo": 3, "outer": 3, "far": 3}
     assert results.series[0].num_timesteps == [0, 64, 128, 192, 256]
+    assert results.primary == {"pendulum": "far"}  # the rival is no candidate
+    assert results.scores["pendulum"]["ppo"] == pytest.approx(1)
     assert {(f.arm, f.against) for f in results.figures} == {
         *(("outer", "ppo"), ("far", "ppo")),
         *(("ppo", "outer"), ("far", "outer")),
@@ -412,7 +414,10 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     page.write_text("<!-- live of out/test/results.json -->\n<!-- end of live -->\n")
     run_command("tipl report out/test/results.json --into page.md")
     assert page.read_text().count("\n| ") == 2 + 4
-    assert (plan.parent / "results/pendulum.svg").read_text().startswith("\n<!DOCTYPE svg")
+    assert "far was the best on the tuning seeds" in page.read_text()
+    for name in ("pendulum.svg", "pendulum-ratios.svg"):
+        assert f"](out/test/{name})" in page.read_text()
+        assert (plan.parent / "out/test" / name).read_text().startswith("\n<!DOCTYPE svg")
 
 
 @pytest.mark.long

@@ -91,6 +91,11 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     forecaster: str
     jump: JumpConfig
 
+    @property
+    def folder(self) -> Path:
+        """Folder of its trainings; no name in it has a colon, which Windows does not allow."""
+        return Path(*self.name.split(":"))
+
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A study."""

@@ -92,6 +92,11 @@ class LiveResults(msgspec.Struct, frozen=True, kw_only=True):
     """Interquartile mean of the final return, by task and trial."""
     best: dict[str, dict[str, str]]
     """Best trial of each arm, by task and arm."""
+    scores: dict[str, dict[str, float]]
+    """What tuning minimises, by task and trial: the geometric mean over thresholds and seeds of the
+    ratio of environment steps, against the baseline."""
+    primary: dict[str, str]
+    """By task, the arm that forecasts and was best on the tuning seeds, the rival aside."""
     series: list[Series]
     figures: list[Figure]
     command: str

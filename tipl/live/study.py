@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,7 +91,7 @@ def _blocks(plan: Plan, config: LiveConfig) -> Iterator[Block]:
             for group in groups:
                 name = f"{group[0]}-{group[-1]}.json"
                 yield Block(
-                    file=config.out / config.stage / task / trial.name / name,
+                    file=config.out / config.stage / task / trial.folder / name,
                     task=task,
                     trial=trial,
                     config=ppo,
@@ -175,15 +176,18 @@ def _results(plan: Plan, config: LiveConfig, series: Sequence[Series], command: 
     thresholds: dict[str, dict[str, float]] = {}
     finals: dict[str, dict[str, float]] = {}
     best: dict[str, dict[str, str]] = {}
+    scores: dict[str, dict[str, float]] = {}
     figures: list[Figure] = []
     for task in dict.fromkeys(one.task for one in series):
         mine = [one for one in series if one.task == task]
         (baseline,) = (one for one in mine if one.arm == plan.baseline)
         limits = thresholds[task] = thresholds_of(plan, baseline)
         finals[task] = {one.trial: final(one, plan.evaluation_of(task)) for one in mine}
-        scores = {one.trial: mean_log_ratio(plan, one, baseline, limits) for one in mine}
+        score = scores[task] = {
+            one.trial: math.exp(mean_log_ratio(plan, one, baseline, limits)) for one in mine
+        }
         best[task] = {
-            arm: min((one.trial for one in mine if one.arm == arm), key=scores.__getitem__)
+            arm: min((one.trial for one in mine if one.arm == arm), key=score.__getitem__)
             for arm in dict.fromkeys(one.arm for one in mine)
         }
         chosen = [one for one in mine if best[task][one.arm] == one.trial]
@@ -192,6 +196,12 @@ def _results(plan: Plan, config: LiveConfig, series: Sequence[Series], command: 
             for one in chosen:
                 if one.arm != other.arm:
                     figures += compare(plan, one, other, limits)
+    file = config.out / "tuning" / RESULTS
+    if config.stage == "test" and file.exists():
+        earlier = read_live(file)
+        tuned = earlier.best, earlier.scores
+    else:
+        tuned = best, scores
     builtins: dict[str, Any] = msgspec.to_builtins(plan)
     return LiveResults(
         study=plan.id,
@@ -202,10 +212,37 @@ def _results(plan: Plan, config: LiveConfig, series: Sequence[Series], command: 
         thresholds=thresholds,
         final=finals,
         best=best,
+        scores=scores,
+        primary=_primary(plan, tuned, best),
         series=list(series),
         figures=figures,
         command=command,
     )
+
+
+def _primary(
+    plan: Plan,
+    tuned: tuple[Mapping[str, Mapping[str, str]], Mapping[str, Mapping[str, float]]],
+    best: Mapping[str, Mapping[str, str]],
+) -> dict[str, str]:
+    """Return by task the arm that forecasts and was best on the tuning seeds, the rival aside.
+
+    Args:
+        plan: the study.
+        tuned: best trials and scores of the tuning seeds.
+        best: best trials of this stage; their arms are looked at.
+    """
+    trials, scores = tuned
+    found = {}
+    for task, arms in best.items():
+        ranked = {
+            arm: scores[task][trials[task][arm]]
+            for arm in arms
+            if arm in trials.get(task, {}) and plan.arms[arm].forecaster and arm != plan.rival
+        }
+        if ranked:
+            found[task] = min(ranked, key=ranked.__getitem__)
+    return found
 
 
 def _csv(series: Sequence[Series]) -> str:

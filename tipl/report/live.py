@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,20 +26,32 @@ _WHAT = "live"
 
 
 def insert_live(results: LiveResults, source: Path, page: Path) -> None:
-    """Write every place of a study's results in a Markdown page, and the curves beside it.
+    """Write every place of a study's results in a Markdown page, and draw the figures it shows.
+
+    The figures lie beside the results.
 
     A place begins with ``<!-- live of FILE, TASK -->``, with the task's hyphens as underscores, or
     ``<!-- live of FILE -->`` for all tasks, and ends with ``<!-- end of live -->``.
     """
     old = page.read_text(encoding="utf-8")
-    new = rewrite(old, _WHAT, source.as_posix(), lambda section: render(results, source, section))
+    folder = Path(os.path.relpath(source.parent, page.parent)).as_posix()
+    new = rewrite(
+        old, _WHAT, source.as_posix(), lambda section: render(results, source, folder, section)
+    )
     if any(place.source == source.as_posix() for place in places(new)):
-        write_figures(results, page.parent / source.stem)
+        write_figures(results, source.parent)
     replace_file(page.resolve(), new.encode())
 
 
-def render(results: LiveResults, source: Path, section: str) -> str:
-    """Return the tables and the learning curves of a task, or of all."""
+def render(results: LiveResults, source: Path, folder: str, section: str) -> str:
+    """Return the tables and the figures of a task, or of all.
+
+    Args:
+        results: of one stage of a study.
+        source: their file, for messages.
+        folder: the figures' folder, as the page links to it.
+        section: a task with underscores, or ``overview`` for all.
+    """
     wanted = [
         task
         for task in results.thresholds
@@ -54,7 +67,9 @@ def render(results: LiveResults, source: Path, section: str) -> str:
         )
     parts = []
     for task in wanted:
-        parts += [f"![Learning curves of {task}]({source.stem}/{file_name(task)})"]
+        parts.append(verdict(results, task))
+        parts.append(f"![Learning curves of {task}]({folder}/{task}.svg)")
+        parts.append(f"![Ratios of environment steps, {task}]({folder}/{task}-ratios.svg)")
         for against in dict.fromkeys((results.baseline, results.rival)):
             if rows_of(results, task, against):
                 parts.append(_markdown(results, task, against))
@@ -92,13 +107,38 @@ def write_figures(results: LiveResults, folder: Path) -> None:
     """Draw the learning curves of each task into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for task in results.thresholds:
-        content = svg(curves_figure(results, task)).encode()
-        replace_file(folder / file_name(task), content)
+        for name, figure in (
+            (f"{task}.svg", curves_figure(results, task)),
+            (f"{task}-ratios.svg", ratios_figure(results, task)),
+        ):
+            replace_file(folder / name, svg(figure).encode())
 
 
-def file_name(task: str) -> str:
-    """Return the file name of a task's learning curves."""
-    return f"{task}.svg"
+def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
+    """Return in sentences how the arm that was best on the tuning seeds did, beside the others."""
+    arm = results.primary.get(task)
+    names = {f"steps to {threshold} %", "final"}
+    told = []
+    for against in dict.fromkeys((results.baseline, results.rival)):
+        found = {
+            figure.name: _text(figure, interval=True)
+            for figure in results.figures
+            if (figure.task, figure.arm, figure.against) == (task, arm, against)
+            and figure.name in names
+        }
+        if len(found) == len(names):
+            told.append(
+                f"{found[f'steps to {threshold} %']} of the environment steps of "
+                f"{escaped(results.best[task][against])} (final return {found['final']})"
+            )
+    count = len(chosen(results, task, results.baseline).curves)
+    if arm is None or not told:
+        return f"**{escaped(task)}**, {count} seeds:"
+    return (
+        f"**{escaped(task)}**, {count} seeds. Of the arms that forecast, "
+        f"{escaped(results.best[task][arm])} was the best on the tuning seeds. To {threshold} % of "
+        f"the return that {escaped(results.baseline)} ends with, it needs {' and '.join(told)}."
+    )
 
 
 def curves_figure(results: LiveResults, task: str) -> Drawing:
@@ -120,6 +160,36 @@ def curves_figure(results: LiveResults, task: str) -> Drawing:
     axes.set_title(f"{task}, {len(chosen(results, task, results.baseline).curves)} seeds")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8)
+    return fig
+
+
+def ratios_figure(results: LiveResults, task: str) -> Drawing:
+    """Return the ratios of environment steps to each threshold, against both other arms."""
+    rivals = [a for a in dict.fromkeys((results.baseline, results.rival)) if a]
+    shares = list(results.thresholds[task])
+    arms = rows_of(results, task, results.baseline)
+    fig = Drawing(figsize=(9, 1 + 0.45 * len(arms)), layout="constrained")
+    for axes, against in zip(
+        fig.subplots(1, len(rivals), sharey=True, squeeze=False)[0], rivals, strict=True
+    ):
+        for figure in results.figures:
+            name = figure.name.removeprefix("steps to ").removesuffix(" %")
+            if (figure.task, figure.against) != (task, against) or name not in shares:
+                continue
+            if figure.value is None or figure.arm not in arms:
+                continue
+            place = shares.index(name)
+            y = -arms.index(figure.arm) - 0.18 * (place - (len(shares) - 1) / 2)
+            colour = _COLOURS[place % len(_COLOURS)]
+            axes.plot([figure.low, figure.high], [y, y], color=colour, lw=2)
+            label = f"to {name} %" if figure.arm == arms[0] else None
+            axes.plot(figure.value, y, "o", color=colour, ms=4, label=label)
+        axes.axvline(1, color="#1c1c1c", lw=0.8)
+        axes.set_xlabel(f"environment steps over those of {results.best[task][against]}")
+        axes.set_yticks([-i for i in range(len(arms))], [results.best[task][arm] for arm in arms])
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    fig.axes[0].legend(fontsize=7)
     return fig
 
 
