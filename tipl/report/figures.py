@@ -15,6 +15,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from tipl.evaluation.results import GainRow, Measure, Results, Row
 from tipl.report.scores import (
@@ -99,7 +100,7 @@ def _bands(results: Results, panels: dict[str, Measure], y: str, top: float) -> 
     for axes, (title, measure) in zip(all_axes, panels.items(), strict=True):
         for name, style in styles(results).items():
             _draw_band(axes, measure(results.forecasters[name]), style)
-        axes.set_xscale("log")
+        _logarithmic(axes)
         axes.set_ylim(_LOWEST, top)
         _name_those_outside(axes)
         axes.set_title(title, fontsize=10)
@@ -125,7 +126,7 @@ def return_figure(results: Results) -> Figure:
         axes.plot(
             *_curve(results.forecasters[PERSISTENCE].gain.get(mode, ()), "later", each), **trained
         )
-        axes.set_xscale("log")
+        _logarithmic(axes)
         axes.set_title(MODE_NAMES[mode], fontsize=10)
         x = "horizon h, snapshots" if each is None else "environment steps that PPO takes meanwhile"
         _label(axes, x, "return" if axes is all_axes[0] else "")
@@ -226,6 +227,14 @@ def _name_those_outside(axes: Axes) -> None:
             box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1}
             at = axes.transAxes
             axes.text(0.02, y, text, transform=at, fontsize=7, va=va, bbox=box, zorder=5)
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Make the axis of horizons or steps logarithmic, with numbers at 1, 2 and 5 times 10^n."""
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _label(axes: Axes, x: str, y: str) -> None:

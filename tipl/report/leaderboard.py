@@ -16,6 +16,7 @@ from weighttraj.text import markdown as escaped
 
 COLUMNS = ("tasks", "score", "error ratio", "wins", "wins over rival", "rank", "CPU ms")
 """Columns of a leaderboard behind the forecaster."""
+_ORDER = ("skill", "gain", "function skill")
 
 
 def cells(entry: Entry, *, interval: bool = True) -> tuple[str, ...]:
@@ -46,7 +47,7 @@ def markdown(board: Leaderboard) -> str:
     parts = []
     for (measure, horizon), entries in _groups(board):
         lines = [
-            f"**{measure}, {horizon} snapshots ahead**",
+            f"**{measure}, {horizon} snapshot{'' if horizon == 1 else 's'} ahead**",
             "",
             f"| forecaster | {' | '.join(COLUMNS)} |",
             f"|---|{'---:|' * len(COLUMNS)}",
@@ -57,7 +58,9 @@ def markdown(board: Leaderboard) -> str:
 
 
 def _groups(board: Leaderboard) -> Iterator[tuple[tuple[str, int], list[Entry]]]:
-    for key in dict.fromkeys((e.measure, e.horizon) for e in board.entries):
+    """Yield the entries of each measure and horizon: those of weights first, then returns."""
+    keys = dict.fromkeys((e.measure, e.horizon) for e in board.entries)
+    for key in sorted(keys, key=lambda key: (_ORDER.index(key[0]), key[1])):
         yield key, [e for e in board.entries if (e.measure, e.horizon) == key]
 
 
