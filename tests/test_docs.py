@@ -36,7 +36,7 @@ def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPa
 
 
 GUIDES = (
-    "install quickstart glossary read collect train evaluate publish bring-your-own supported "
+    "install quickstart glossary read collect train evaluate jump-ahead publish bring-your-own supported "
     "clusters design"
 )
 
@@ -166,7 +166,7 @@ def test_evaluate(reader: Path, brief_released: Path, monkeypatch: pytest.Monkey
 
 
 def test_live(reader: Path) -> None:
-    names = run_page(DOCS / "live.md", {"16 * 2048": "2 * 2048", "first=3": "first=1"})
+    names = run_page(DOCS / "jump-ahead.md", {"16 * 2048": "2 * 2048", "first=3": "first=1"})
     assert [jump.iteration for jump in names["callback"].jumps] == [1]
     results = read_live(reader / "data/demo/study/test/results.json")
     assert {one.arm: len(one.curves) for one in results.series} == {

@@ -239,7 +239,7 @@ for _kind in (
     Kind(
         name="causal",
         forecaster="tipl.models.causal.forecaster:Causal",
-        help="Train tipl-causal, TIPL on the past alone; minutes.",
+        help="Train tipl-causal, which uses only the past; minutes.",
         command="causal",
         train="tipl.models.causal.train:train_causal",
         refit="tipl.models.causal.train:refit",
@@ -248,7 +248,7 @@ for _kind in (
     Kind(
         name="drift",  # what saved ones are called: the first was tipl-drift
         forecaster="tipl.models.scaled.forecaster:ScaledGate",
-        help="Choose the length of a forecast by returns; minutes.",
+        help="Stretch a model's forecasts as returns say; minutes.",
         command="scaled",
         train="tipl.models.scaled.train:train_scaled",
         refit="tipl.models.scaled.train:refit",

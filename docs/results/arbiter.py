@@ -27,6 +27,7 @@ from pathlib import Path
 from answers import answers, findings
 from board import (
     HERE,
+    LADDER_BATCHES,
     LADDER_SEEDS,
     LADDER_TASKS,
     PAPER,
@@ -121,7 +122,7 @@ def plan() -> list[Step]:
 
 
 def _ladder() -> Iterator[str]:
-    batches = "--n-batches 1000"
+    batches = f"--n-batches {LADDER_BATCHES}"
     tipl = f"{batches} --warmup 100 --save-every 250"
     better = f"{tipl} --schedule cosine --ema 0.99"
     for seed in LADDER_SEEDS:

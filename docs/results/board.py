@@ -27,6 +27,8 @@ LADDER_TASKS = tuple(task for task in TASKS if TASKS[task] in LADDER)
 """Tasks of the ladder from TIPL to tipl-gate."""
 SEEDS, LADDER_SEEDS = (0, 1, 2), (0,)
 """Seeds of the trainings."""
+LADDER_BATCHES = 1000
+"""Number of batches of TIPL and of tipl-causal on the ladder."""
 LEARNED = (
     "tipl-gate",
     "tipl-gate-tuned",
@@ -42,11 +44,11 @@ RIVAL = "ar-20-phase"
 PAPER_SPLITS = {"train": "training runs, as in the paper", "test": "test runs"}
 """The paper names no held-out runs: TIPL is evaluated on the runs it was trained on as well."""
 RUNGS = {
-    "tipl-published": "TIPL as published",
+    "tipl-published": "TIPL's design",
     "tipl-decayed": "+ learning rate falls, average of the weights",
     "tipl-residual": "+ predicts the step, not the position",
     "causal-first": "+ basis of the path so far, a head for each horizon",
-    "causal": "+ measured in the steps around the start",
+    "causal": "+ scaled by the steps around the start",
     "gate-own": "one small network for all parameters (tipl-gate)",
     "tipl-gate": "+ trained on all seven tasks",
 }

@@ -148,7 +148,7 @@ def test_titles_are_those_of_the_figures(demo: dict[str, Any]) -> None:
 def test_sentences_say_what_was_done_found_and_how_sure_it_is(many: dict[str, Any]) -> None:
     first, tipl, second, weights, returns, bound, last = sentences(typed(many))
     assert first.startswith("The models forecast the weights of 10 runs that they were not")
-    assert "gain is the share of the return" in first
+    assert "gain is what the forecast adds" in first
     far = row_at(typed(many).forecasters["tipl"], SKILL, 10)
     assert tipl.startswith("TIPL, which uses the future of the run, has skill ")
     assert f" and {cell(far)} at h = 10; its gain is " in tipl

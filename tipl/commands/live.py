@@ -26,7 +26,7 @@ class LiveCommand(LiveConfig):
     """
 
     plan: tyro.conf.Positional[Path]
-    """The plan, a TOML file: see docs/live.md."""
+    """The plan, a TOML file: see docs/jump-ahead.md."""
 
 
 def live(args: LiveCommand) -> None:

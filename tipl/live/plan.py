@@ -150,7 +150,7 @@ def read_plan(file: Path) -> Plan:
     except (ValueError, WeightTrajError, RecursionError) as error:
         raise EvaluateError(
             "the plan of the study is invalid",
-            expected="seeds, tasks and arms, as docs/live.md describes them",
+            expected="seeds, tasks and arms, as docs/jump-ahead.md describes them",
             got=error,
             where=file,
             do="correct the file",

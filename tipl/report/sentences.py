@@ -48,7 +48,10 @@ def _opening(results: Results) -> str:
         else f"that {they} not trained on"
     )
     runs = f"{len(results.runs)} runs" if len(results.runs) != 1 else "1 run"
-    gain = "; gain is the share of the return that training gains in h snapshots"
+    gain = (
+        "; gain is what the forecast adds to the return, divided by what h more snapshots of "
+        "training add"
+    )
     return (
         f"{who} the weights of {runs} {seen}, h snapshots ahead. Persistence repeats the last "
         "weights. Skill compares squared errors of the weights: it is 1 for a perfect forecast "
@@ -118,8 +121,9 @@ def _bound(results: Results) -> Iterator[str]:
     if found := [label(name) for name in oracles(results)]:
         what = "is not a forecast" if len(found) == 1 else "are not forecasts"
         yield (
-            f"{' and '.join(found)} {what}: the true weights after a round trip through as many "
-            "coefficients, the best that TIPL can reach with these; other models can be better."
+            f"{' and '.join(found)} {what}: the true future weights, compressed to the "
+            "number of coefficients that TIPL writes, and back. TIPL cannot do better than that; "
+            "other models can."
         )
 
 

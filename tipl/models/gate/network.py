@@ -43,14 +43,14 @@ class GateConfig:
     betas: tuple[float, ...] = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
     """Decays of the exponential moving averages of all steps."""
     phases: int = 0
-    """Number of snapshots in an iteration of PPO. When a training begins, 0 stands for that of its
-    runs."""
+    """Number of snapshots in an iteration of PPO; 0: that of the training runs."""
     width: int = 48
     """Number of units of a hidden layer."""
     experts: int = 8
     """Number of linear filters that are mixed."""
     without: tuple[Input, ...] = ()
-    """Inputs that are replaced by zeros, to learn what they are worth."""
+    """Inputs that are replaced by zeros; docs/studies/gate_inputs.md says what each is worth. The
+    released tipl-gate does without ``time``."""
     adam: bool = False
     """Whether the network sees Adam's moments, which the runs must store."""
 

@@ -28,7 +28,7 @@ LOOP = LoopConfig(n_batches=4_000, batch_size=32, learning_rate=3e-3)
 
 @dataclass(frozen=True, kw_only=True)
 class GateTrainConfig(StartsConfig):
-    """What is trained on, and where the model goes. A start in a batch has 128 parameters."""
+    """What is trained on, and where the model goes. Each start in a batch has 128 parameters."""
 
     network: GateConfig = NETWORK
     """Sizes of the network."""
