@@ -36,8 +36,8 @@ def test_the_page_says_what_was_measured(name: str, monkeypatch: pytest.MonkeyPa
 
 
 GUIDES = (
-    "install quickstart glossary read collect train evaluate jump-ahead publish bring-your-own supported "
-    "clusters design"
+    "install quickstart glossary read collect train evaluate jump-ahead publish bring-your-own "
+    "supported clusters design"
 )
 
 
