@@ -279,11 +279,8 @@ def keep_paper() -> None:
         found[split] = {
             name: {
                 "WPE": [_at(results.forecasters[name].wpe, h) for h in (1, 10)],
-                "REPW while learning": [
+                "REPW": [
                     _at(results.forecasters[name].repw["sampled"]["learning"], h) for h in (1, 10)
-                ],
-                "REPW after it": [
-                    _at(results.forecasters[name].repw["sampled"]["plateau"], h) for h in (1, 10)
                 ],
             }
             for name in ("persistence", PUBLISHED)

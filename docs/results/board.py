@@ -41,7 +41,7 @@ SIMPLE = "last-iteration-tuned"
 """What a learned forecast has to beat in return."""
 RIVAL = "ar-20-phase"
 """What a learned forecast has to beat in weights."""
-PAPER_SPLITS = {"train": "training runs, as in the paper", "test": "test runs"}
+PAPER_SPLITS = {"train": "training runs", "test": "test runs"}
 """The paper names no held-out runs: TIPL is evaluated on the runs it was trained on as well."""
 RUNGS = {
     "tipl-published": "TIPL's design",
