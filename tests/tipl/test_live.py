@@ -418,6 +418,10 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     for name in ("pendulum.svg", "pendulum-ratios.svg"):
         assert f"](out/test/{name})" in page.read_text()
         assert (plan.parent / "out/test" / name).read_text().startswith("\n<!DOCTYPE svg")
+    assert "Not run yet" not in page.read_text()
+    run_command("tipl live plan.toml --out out --stage test --arms outer")
+    run_command("tipl report out/test/results.json --into page.md")
+    assert "Not run yet: pendulum (far)." in page.read_text()
 
 
 @pytest.mark.long

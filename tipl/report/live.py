@@ -73,7 +73,22 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         for against in dict.fromkeys((results.baseline, results.rival)):
             if rows_of(results, task, against):
                 parts.append(_markdown(results, task, against))
+    if section == "overview" and (told := not_run(results)):
+        parts.append(told)
     return "\n\n".join(parts) + "\n"
+
+
+def not_run(results: LiveResults) -> str:
+    """Return a sentence on the arms and tasks of the plan without results, or nothing."""
+    arms, parts = results.plan["arms"], []
+    for task in results.plan["tasks"]:
+        wanted = [name for name, arm in arms.items() if not arm["tasks"] or task in arm["tasks"]]
+        missing = [escaped(name) for name in wanted if name not in results.best.get(task, {})]
+        if len(missing) == len(wanted):
+            parts.append(f"{escaped(task)} (all arms)")
+        elif missing:
+            parts.append(f"{escaped(task)} ({', '.join(missing)})")
+    return f"Not run yet: {'; '.join(parts)}." if parts else ""
 
 
 def rows_of(results: LiveResults, task: str, against: str) -> list[str]:
