@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure as Drawing
+from matplotlib.ticker import StrMethodFormatter
 
 from tipl.errors import EvaluateError
 from tipl.evaluation.statistics import Bootstrap, interquartile_mean
@@ -122,11 +123,12 @@ def write_figures(results: LiveResults, folder: Path) -> None:
     """Draw the learning curves of each task into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for task in results.thresholds:
-        for name, figure in (
-            (f"{task}.svg", curves_figure(results, task)),
-            (f"{task}-ratios.svg", ratios_figure(results, task)),
-        ):
-            replace_file(folder / name, svg(figure).encode())
+        found = {"": curves_figure(results, task), "-ratios": ratios_figure(results, task)}
+        if task in results.primary:
+            few = (results.baseline, results.rival, results.primary[task])
+            found["-primary"] = curves_figure(results, task, few)
+        for suffix, figure in found.items():
+            replace_file(folder / f"{task}{suffix}.svg", svg(figure).encode())
 
 
 def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
@@ -156,11 +158,17 @@ def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
     )
 
 
-def curves_figure(results: LiveResults, task: str) -> Drawing:
-    """Return the learning curves of each arm's best trial: J, with 95 % intervals over seeds."""
-    fig = Drawing(figsize=(9, 5), layout="constrained")
+def curves_figure(results: LiveResults, task: str, only: Sequence[str] = ()) -> Drawing:
+    """Return the learning curves of each arm's best trial: J, with 95 % intervals over seeds.
+
+    Args:
+        results: of one stage of a study.
+        task: one of its tasks.
+        only: the arms that are drawn; empty: all.
+    """
+    fig = Drawing(figsize=(9, 4 if only else 5), layout="constrained")
     axes = fig.subplots()
-    arms = list(results.best[task])
+    arms = [arm for arm in results.best[task] if not only or arm in only]
     others = [arm for arm in arms if arm != results.baseline]
     colours = {arm: _COLOURS[i % len(_COLOURS)] for i, arm in enumerate(others)}
     for arm in arms:
@@ -170,6 +178,7 @@ def curves_figure(results: LiveResults, task: str) -> Drawing:
     for share, value in results.thresholds[task].items():
         axes.axhline(value, lw=0.5, color="#a6acaf")
         axes.annotate(f"{share} %", (axes.get_xlim()[1], value), fontsize=7, color="#7f8c8d")
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_xlabel("environment steps")
     axes.set_ylabel("return J of the policy")
     axes.set_title(f"{task}, {len(chosen(results, task, results.baseline).curves)} seeds")
@@ -200,7 +209,8 @@ def ratios_figure(results: LiveResults, task: str) -> Drawing:
             label = f"to {name} %" if figure.arm == arms[0] else None
             axes.plot(figure.value, y, "o", color=colour, ms=4, label=label)
         axes.axvline(1, color="#1c1c1c", lw=0.8)
-        axes.set_xlabel(f"environment steps over those of {results.best[task][against]}")
+        axes.set_title(f"against {against}", fontsize=10)
+        axes.set_xlabel("ratio of environment steps")
         axes.set_yticks([-i for i in range(len(arms))], [results.best[task][arm] for arm in arms])
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
