@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -20,6 +21,8 @@ import tipl
 import weighttraj as wt
 from tests.pages import QUICKER, blocks, run_command, run_page
 from tipl.live.results import read_live
+from tipl.report.live import render
+from tipl.report.markdown import places, rewrite
 
 DOCS = Path(__file__).parents[1] / "docs"
 STUDIES = Path(__file__).parents[1] / "docs/studies"
@@ -174,6 +177,26 @@ def test_live(reader: Path) -> None:
         "outer-step": 3,
         "ema": 3,
     }
+
+
+@pytest.mark.parametrize("page", ["docs/live.md", "README.md"])
+def test_the_study_of_trainings_says_what_was_measured(
+    page: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(DOCS.parent)
+    text = Path(page).read_text()
+    sources = {place.source for place in places(text) if place.source.startswith("docs/studies")}
+    assert sources
+    for source in sources:
+        folder = os.path.relpath(Path(source).parent, Path(page).parent)
+        results = read_live(Path(source))
+        again = rewrite(
+            text,
+            "live",
+            source,
+            lambda part: render(results, Path(source), folder, part),  # noqa: B023
+        )
+        assert again == text, f"the page is stale: run tipl report {source} --into {page}"
 
 
 def test_the_example_shows_both_curves(

@@ -45,9 +45,6 @@ def findings(weights: Board, returns: Board) -> str:
             f"of {cell(best and best.score)} at h = 50, the last iteration's displacement "
             f"{cell(simple and simple.score)}; the gate leads on {gains} of {tasks} tasks with an "
             "interval above 0.",
-            "- What helps in weight error need not help in return: over "
-            + _agreement(weights).partition(" over ")[2].partition(". Best")[0]
-            + ".",
             "- " + _paper(weights).partition(" At h = 1, models")[0],
         ]
     )

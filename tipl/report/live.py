@@ -32,7 +32,8 @@ def insert_live(results: LiveResults, source: Path, page: Path) -> None:
     The figures lie beside the results.
 
     A place begins with ``<!-- live of FILE, TASK -->``, with the task's hyphens as underscores, or
-    ``<!-- live of FILE -->`` for all tasks, and ends with ``<!-- end of live -->``.
+    ``<!-- live of FILE -->`` for all tasks, or ``<!-- live of FILE, summary -->`` for a sentence on
+    each, and ends with ``<!-- end of live -->``.
     """
     old = page.read_text(encoding="utf-8")
     folder = Path(os.path.relpath(source.parent, page.parent)).as_posix()
@@ -51,8 +52,10 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         results: of one stage of a study.
         source: their file, for messages.
         folder: the figures' folder, as the page links to it.
-        section: a task with underscores, or ``overview`` for all.
+        section: a task with underscores, ``overview`` for all, or ``summary`` for sentences alone.
     """
+    if section == "summary":
+        return "\n\n".join(verdict(results, task) for task in results.thresholds)
     wanted = [
         task
         for task in results.thresholds
@@ -61,7 +64,7 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
     if not wanted:
         raise EvaluateError(
             "the results have no such task",
-            expected="overview, for all, or one of " + ", ".join(results.thresholds),
+            expected="overview, for all, summary, or one of " + ", ".join(results.thresholds),
             got=section,
             where=source,
             do="correct the marker in the page",
@@ -76,7 +79,7 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
                 parts.append(_markdown(results, task, against))
     if section == "overview" and (told := not_run(results)):
         parts.append(told)
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(parts)
 
 
 def not_run(results: LiveResults) -> str:
@@ -132,29 +135,22 @@ def write_figures(results: LiveResults, folder: Path) -> None:
 
 
 def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
-    """Return in sentences how the arm that was best on the tuning seeds did, beside the others."""
-    arm = results.primary.get(task)
-    names = {f"steps to {threshold} %", "final"}
-    told = []
-    for against in dict.fromkeys((results.baseline, results.rival)):
-        found = {
-            figure.name: _text(figure, interval=True)
-            for figure in results.figures
-            if (figure.task, figure.arm, figure.against) == (task, arm, against)
-            and figure.name in names
-        }
-        if len(found) == len(names):
-            told.append(
-                f"{found[f'steps to {threshold} %']} of the environment steps of "
-                f"{escaped(results.best[task][against])} (final return {found['final']})"
-            )
+    """Return a sentence on the arm that was best on the tuning seeds, beside the other two."""
+    arm, name = results.primary.get(task), f"steps to {threshold} %"
+    told = [
+        f"{_text(figure, interval=True)} times the environment steps of "
+        f"{escaped(results.best[task][figure.against])}"
+        for figure in results.figures
+        if (figure.task, figure.arm, figure.name) == (task, arm, name)
+    ]
     count = len(chosen(results, task, results.baseline).curves)
+    begun = f"**{escaped(task)}**, {count} {results.stage} seeds:"
     if arm is None or not told:
-        return f"**{escaped(task)}**, {count} seeds:"
+        return begun
     return (
-        f"**{escaped(task)}**, {count} seeds. Of the arms that forecast, "
-        f"{escaped(results.best[task][arm])} was the best on the tuning seeds. To {threshold} % of "
-        f"the return that {escaped(results.baseline)} ends with, it needs {' and '.join(told)}."
+        f"{begun} to {threshold} % of the return that {escaped(results.baseline)} ends with, "
+        f"{escaped(results.best[task][arm])} needs {' and '.join(told)}. It is the forecast that "
+        "was best on the tuning seeds."
     )
 
 
