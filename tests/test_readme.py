@@ -90,6 +90,7 @@ def test_readme_shows_the_demo_the_results_and_the_models() -> None:
     assert shown == [
         ("results", "datasets/demo/results.json", "table", False),
         ("models", "zoo", "overview", False),
+        ("live", "docs/studies/live/test/results.json", "summary", False),
     ]
 
 

@@ -232,7 +232,7 @@ def test_no_page_is_wider_than_a_narrow_window(place: Path, browser: list[str]) 
     wide = "| a | b |\n|---|---|\n| " + " | ".join(["`unbroken" * 20 + "`"] * 2) + " |\n"
     card.write_text(card.read_text() + "\n" + wide + "\n```bash\n" + "long " * 100 + "\n```\n")
     index = make(place)
-    for name in ("index", "cards/a-model", "data/small"):
+    for name in ("index", "models/a-model", "data/small"):
         page = index.parent / f"{name}.html"
         allowed = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page.read_text())
         page.write_text(allowed + MEASURE)
