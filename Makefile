@@ -32,6 +32,9 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	$(BIN)/tipl report datasets/demo/results.json --into README.md
 	$(BIN)/tipl report datasets/demo/results.json --into docs/quickstart.md
 	$(BIN)/python docs/results/arbiter.py
+	$(BIN)/tipl report docs/studies/live/test/results.json --into README.md
+	$(BIN)/tipl report docs/studies/live/test/results.json --into docs/live.md
+	$(BIN)/tipl report docs/studies/live/tuning/results.json --into docs/live.md
 	$(BIN)/tipl zoo --into README.md
 	$(BIN)/python datasets/pages.py
 	$(BIN)/python examples/plot_path_and_returns.py docs/path-and-returns.png
