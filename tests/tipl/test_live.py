@@ -421,6 +421,9 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
         assert (plan.parent / "out/test" / name).read_text().startswith("\n<!DOCTYPE svg")
     assert "Not run yet" not in page.read_text()
     run_command("tipl live plan.toml --out out --stage test --arms outer")
+    assert read_live(plan.parent / "out/test/results.json").figures == results.figures
+    (plan.parent / "out/test/pendulum/far/22-22.json").unlink()
+    run_command("tipl live plan.toml --out out --stage test --arms outer")
     run_command("tipl report out/test/results.json --into page.md")
     assert "Not run yet: pendulum (far)." in page.read_text()
 
@@ -466,11 +469,12 @@ def test_an_invalid_plan_is_refused(plan: Path, old: str, new: str, told: str) -
         read_plan(plan)
 
 
-def test_the_published_plan_can_be_read() -> None:
-    plan = read_plan(ROOT / "docs/studies/live.toml")
+@pytest.mark.parametrize(("study", "trials_each"), [("live", 6), ("confirm", 9)])
+def test_a_published_plan_can_be_read(study: str, trials_each: int) -> None:
+    plan = read_plan(ROOT / f"docs/studies/{study}.toml")
     for task in plan.tasks:
         trials = plan.trials(task)
-        assert {len(some) for name, some in trials.items() if name != "ppo"} == {6}
+        assert {len(some) for name, some in trials.items() if name != "ppo"} == {trials_each}
         ppo, every = ppo_of(plan, task, ROOT / "docs/studies")
         assert ppo.gradient_steps_per_iteration // every == 5
 

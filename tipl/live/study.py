@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,10 @@ class LiveConfig:
     """``tuning``: all points of the grids on the tuning seeds; ``test``: of each arm the best point
     on the test seeds."""
     tasks: tuple[str, ...] = ()
-    """Tasks to run; empty: all of the plan."""
+    """Tasks to train on; empty: all of the plan."""
     arms: tuple[str, ...] = ()
-    """Arms to run; empty: all of the plan. The baseline always runs."""
+    """Arms to train; empty: all of the plan. The baseline always runs. Results also hold the arms
+    that were trained earlier."""
     seeds: int | None = None
     """Number of seeds, the first ones; unset: all of the stage."""
     workers: int = 1
@@ -55,16 +56,17 @@ def run_live(
     """Train what is missing, and write ``results.json`` and ``curves.csv``.
 
     Each population of seeds is a file; those that are there and have the same settings are left
-    alone. So a study that was stopped goes on with the same command.
+    alone. So a study that was stopped goes on with the same command. The results hold every arm of
+    the plan whose trainings are all there, those of earlier commands too.
 
     Raises:
         EvaluateError: the plan is invalid, or the stage ``test`` comes before the tuning.
         KeyboardInterrupt: it was stopped; finished populations are kept.
     """
     plan = read_plan(config.plan)
-    blocks = list(_blocks(plan, config))
-    _make([block for block in blocks if read_block(block) is None], config, console)
-    series = _series(blocks)
+    missing = [block for block in _blocks(plan, config) if read_block(block) is None]
+    _make(missing, config, console)
+    series = _series(plan, config)
     results = _results(plan, config, series, command)
     folder = config.out / config.stage
     write_json(folder / RESULTS, results)
@@ -109,22 +111,22 @@ def _trials(plan: Plan, config: LiveConfig, task: str) -> Iterator[Trial]:
         if config.stage == "tuning" or len(trials) == 1:
             yield from trials
         else:
-            best = _tuned(config, task, arm)
-            yield next((t for t in trials if t.name == best), trials[0])
+            yield _tuned(config, task, arm, trials)
 
 
-def _tuned(config: LiveConfig, task: str, arm: str) -> str:
-    """Return the name of the arm's best trial on the tuning seeds."""
+def _tuned(config: LiveConfig, task: str, arm: str, trials: Sequence[Trial]) -> Trial:
+    """Return the arm's best trial on the tuning seeds."""
     file = config.out / "tuning" / RESULTS
-    found = read_live(file).best.get(task, {}).get(arm) if file.exists() else None
-    if found is None:
-        raise EvaluateError(
-            "the arm has a grid, and was not tuned",
-            expected=f"results of the tuning seeds in {file}",
-            got=f"none of arm {arm!r} on task {task!r}",
-            do=f"run: tipl live {config.plan} --out {config.out} --stage tuning",
-        )
-    return found
+    best = read_live(file).best.get(task, {}).get(arm) if file.exists() else None
+    for trial in trials:
+        if trial.name == best:
+            return trial
+    raise EvaluateError(
+        "the arm has a grid, and was not tuned",
+        expected=f"the best point of its grid in {file}",
+        got=f"{best or 'nothing'} of arm {arm!r} on task {task!r}",
+        do=f"run: tipl live {config.plan} --out {config.out} --stage tuning",
+    )
 
 
 def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) -> None:
@@ -148,13 +150,34 @@ def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) 
                 raise outcome
 
 
-def _series(blocks: Sequence[Block]) -> list[Series]:
-    """Return the trainings of each trial on each task."""
-    found: dict[tuple[str, str], list[tuple[Block, Made]]] = {}
+def _series(plan: Plan, config: LiveConfig) -> list[Series]:
+    """Return the trainings of each trial on each task, of the arms whose trainings are all there.
+
+    A task is left out where those of the baseline are not.
+    """
+    series = []
+    for task in plan.tasks:
+        made: dict[str, list[Series]] = {}
+        for arm in plan.arms:
+            if found := _finished(plan, replace(config, tasks=(task,), arms=(arm,)), arm):
+                made[arm] = found
+        if plan.baseline in made:
+            series += [one for found in made.values() for one in found]
+    return series
+
+
+def _finished(plan: Plan, config: LiveConfig, arm: str) -> list[Series]:
+    """Return the trainings of each trial of an arm on a task; empty: some are missing."""
+    pairs: dict[str, list[tuple[Block, Made]]] = {}
+    try:
+        blocks = [block for block in _blocks(plan, config) if block.trial.arm == arm]
+    except EvaluateError:  # not tuned
+        return []
     for block in blocks:
-        if (made := read_block(block)) is not None:
-            found.setdefault((block.task, block.trial.name), []).append((block, made))
-    return [_joined(pairs) for pairs in found.values()]
+        if (made := read_block(block)) is None:
+            return []
+        pairs.setdefault(block.trial.name, []).append((block, made))
+    return [_joined(some) for some in pairs.values()]
 
 
 def _joined(pairs: Sequence[tuple[Block, Made]]) -> Series:
