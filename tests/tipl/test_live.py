@@ -414,8 +414,10 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     places = ("out/test/results.json, summary", "out/test/results.json")
     page.write_text("".join(f"<!-- live of {x} -->\n<!-- end of live -->\n" for x in places))
     run_command("tipl report out/test/results.json --into page.md")
-    assert page.read_text().count("\n| ") == 2 + 4
-    assert page.read_text().count("It is the forecast that was best on the tuning seeds.") == 2
+    assert page.read_text().count("\n| ") == 2 + 2 + 4
+    assert page.read_text().count("It is the forecast that was best on the tuning seeds.") == 1
+    assert "| pendulum, 3 test seeds | far | " in page.read_text()
+    assert "| outer (amplitude " in page.read_text()
     for name in ("pendulum.svg", "pendulum-ratios.svg"):
         assert f"](out/test/{name})" in page.read_text()
         assert (plan.parent / "out/test" / name).read_text().startswith("\n<!DOCTYPE svg")

@@ -32,8 +32,8 @@ def insert_live(results: LiveResults, source: Path, page: Path) -> None:
     The figures lie beside the results.
 
     A place begins with ``<!-- live of FILE, TASK -->``, with the task's hyphens as underscores, or
-    ``<!-- live of FILE -->`` for all tasks, or ``<!-- live of FILE, summary -->`` for a sentence on
-    each, and ends with ``<!-- end of live -->``.
+    ``<!-- live of FILE -->`` for all tasks, or ``<!-- live of FILE, summary -->`` for a table with
+    a line for each, and ends with ``<!-- end of live -->``.
     """
     old = page.read_text(encoding="utf-8")
     folder = Path(os.path.relpath(source.parent, page.parent)).as_posix()
@@ -52,10 +52,10 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         results: of one stage of a study.
         source: their file, for messages.
         folder: the figures' folder, as the page links to it.
-        section: a task with underscores, ``overview`` for all, or ``summary`` for sentences alone.
+        section: a task with underscores, ``overview`` for all, or ``summary`` for a line each.
     """
     if section == "summary":
-        return "\n\n".join(verdict(results, task) for task in results.thresholds)
+        return summary(results)
     wanted = [
         task
         for task in results.thresholds
@@ -122,6 +122,15 @@ def chosen(results: LiveResults, task: str, arm: str) -> Series:
     return next(one for one in results.series if (one.task, one.trial) == (task, best))
 
 
+def arm_label(results: LiveResults, task: str, arm: str) -> str:
+    """Return an arm and the best values of its grid, in words."""
+    _, _, point = results.best[task][arm].partition(":")
+    values = [value.replace("=", " ").replace("_", " ") for value in point.split(",") if value]
+    # A learning rate is a factor of the plan's.
+    told = ", ".join(value.replace("learning rate ", "learning rate x") for value in values)
+    return f"{arm} ({told})" if told else arm
+
+
 def write_figures(results: LiveResults, folder: Path) -> None:
     """Draw the learning curves of each task into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -134,23 +143,48 @@ def write_figures(results: LiveResults, folder: Path) -> None:
             replace_file(folder / f"{task}{suffix}.svg", svg(figure).encode())
 
 
+def summary(results: LiveResults, threshold: str = "90") -> str:
+    """Return a table of the arms that were best on the tuning seeds, a task a line."""
+    others = [arm for arm in dict.fromkeys((results.baseline, results.rival)) if arm]
+    lines = [
+        f"| task | best forecast of the tuning | steps to {threshold} %, against "
+        f"{' | against '.join(map(escaped, others))} |",
+        f"|---|---|{'---:|' * len(others)}",
+    ]
+    for task in results.thresholds:
+        arm = results.primary.get(task)
+        name = escaped(arm_label(results, task, arm)) if arm else "-"
+        found = _primary_figures(results, task, threshold)
+        texts = [_text(found.get(against), interval=True) for against in others]
+        count = len(chosen(results, task, results.baseline).curves)
+        begun = f"{escaped(task)}, {count} {results.stage} seeds"
+        lines.append(f"| {begun} | {name} | {' | '.join(texts)} |")
+    return "\n".join(lines)
+
+
+def _primary_figures(results: LiveResults, task: str, threshold: str) -> dict[str, Figure]:
+    """Return the ratios of steps of the primary arm, by the arm it is compared with."""
+    wanted = (task, results.primary.get(task), f"steps to {threshold} %")
+    return {f.against: f for f in results.figures if (f.task, f.arm, f.name) == wanted}
+
+
 def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
     """Return a sentence on the arm that was best on the tuning seeds, beside the other two."""
-    arm, name = results.primary.get(task), f"steps to {threshold} %"
+    arm = results.primary.get(task)
     told = [
-        f"{_text(figure, interval=True)} times the environment steps of "
-        f"{escaped(results.best[task][figure.against])}"
-        for figure in results.figures
-        if (figure.task, figure.arm, figure.name) == (task, arm, name)
+        f"{_text(figure, interval=True)} times {{}} of {escaped(arm_label(results, task, against))}"
+        for against, figure in _primary_figures(results, task, threshold).items()
     ]
     count = len(chosen(results, task, results.baseline).curves)
     begun = f"**{escaped(task)}**, {count} {results.stage} seeds:"
     if arm is None or not told:
         return begun
+    what = ("the environment steps", *["those"] * (len(told) - 1))
+    needs = " and ".join(text.format(word) for text, word in zip(told, what, strict=True))
     return (
-        f"{begun} to {threshold} % of the return that {escaped(results.baseline)} ends with, "
-        f"{escaped(results.best[task][arm])} needs {' and '.join(told)}. It is the forecast that "
-        "was best on the tuning seeds."
+        f"{begun} to {threshold} % of the final return of {escaped(results.baseline)}, "
+        f"{escaped(arm_label(results, task, arm))} needs {needs}. It is the forecast that was best "
+        "on the tuning seeds."
     )
 
 
@@ -170,7 +204,8 @@ def curves_figure(results: LiveResults, task: str, only: Sequence[str] = ()) -> 
     for arm in arms:
         series = chosen(results, task, arm)
         colour = colours.get(arm, "#1c1c1c")
-        _draw(axes, series, colour, "-" if arm in (results.baseline, results.rival) else "--")
+        line = "-" if arm in (results.baseline, results.rival) else "--"
+        _draw(axes, series, arm_label(results, task, arm), colour, line)
     for share, value in results.thresholds[task].items():
         axes.axhline(value, lw=0.5, color="#a6acaf")
         axes.annotate(f"{share} %", (axes.get_xlim()[1], value), fontsize=7, color="#7f8c8d")
@@ -207,21 +242,23 @@ def ratios_figure(results: LiveResults, task: str) -> Drawing:
         axes.axvline(1, color="#1c1c1c", lw=0.8)
         axes.set_title(f"against {against}", fontsize=10)
         axes.set_xlabel("ratio of environment steps")
-        axes.set_yticks([-i for i in range(len(arms))], [results.best[task][arm] for arm in arms])
+        axes.set_yticks(
+            [-i for i in range(len(arms))], [arm_label(results, task, arm) for arm in arms]
+        )
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
     fig.axes[0].legend(fontsize=7)
     return fig
 
 
-def _draw(axes: Any, series: Series, colour: str, line: str) -> None:
+def _draw(axes: Any, series: Series, name: str, colour: str, line: str) -> None:
     """Draw the interquartile mean over seeds, and its interval."""
     returns = np.nan_to_num(returns_of(series), nan=0.0)
     rows = Bootstrap(resamples=500, seed=0).interval(interquartile_mean, returns)
     value, low, high = (
         np.array([row[end] for row in rows], np.float64) for end in ("value", "low", "high")
     )
-    axes.plot(series.num_timesteps, value, color=colour, ls=line, lw=1.5, label=series.trial)
+    axes.plot(series.num_timesteps, value, color=colour, ls=line, lw=1.5, label=name)
     if len(returns) > 1:
         band = {"color": colour, "alpha": 0.12, "linewidth": 0}
         axes.fill_between(series.num_timesteps, low, high, **band)
@@ -232,14 +269,14 @@ def _markdown(results: LiveResults, task: str, against: str) -> str:
     baseline = chosen(results, task, results.baseline)
     lines = [
         f"**{escaped(task)}, {len(baseline.curves)} {results.stage} seeds, against "
-        f"{escaped(results.best[task][against])}**",
+        f"{escaped(arm_label(results, task, against))}**",
         "",
         f"| arm | {' | '.join(COLUMNS)} |",
         f"|---|{'---:|' * len(COLUMNS)}",
     ]
     for arm in rows_of(results, task, against):
         texts = cells(results, task, arm, against)
-        lines.append(f"| {escaped(results.best[task][arm])} | {' | '.join(texts)} |")
+        lines.append(f"| {escaped(arm_label(results, task, arm))} | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 
