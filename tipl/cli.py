@@ -78,7 +78,7 @@ RENAMED = {
     "fit": "train baselines",
     "train-gate": "train gate",
     "train-causal": "train causal",
-    "train-drift": "train scaled",
+    "train-drift": "train stretched",
 }
 """Earlier names."""
 

@@ -246,15 +246,16 @@ for _kind in (
         is_model=True,
     ),
     Kind(
-        name="drift",  # what saved ones are called: the first was tipl-drift
-        forecaster="tipl.models.scaled.forecaster:ScaledGate",
+        name="drift",  # the kind in saved files: the first was tipl-drift
+        forecaster="tipl.models.stretched.forecaster:StretchedGate",
         help="Stretch a model's forecasts as returns say; minutes.",
-        command="scaled",
-        train="tipl.models.scaled.train:train_scaled",
-        refit="tipl.models.scaled.train:refit",
+        command="stretched",
+        train="tipl.models.stretched.train:train_stretched",
+        refit="tipl.models.stretched.train:refit",
         is_model=True,
     ),
-    Kind(name="further", forecaster="tipl.models.scaled.forecaster:Scaled"),
+    # The kind in saved files of stretched forecasters other than a gate.
+    Kind(name="further", forecaster="tipl.models.stretched.forecaster:Stretched"),
     Kind(
         name="regression",
         forecaster="tipl.models.baselines.regression:Regression",

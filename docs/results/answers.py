@@ -34,8 +34,8 @@ def findings(weights: Board, returns: Board) -> str:
     """Return the same in short sentences, for the README."""
     ahead, clear, tasks = weights.wins("tipl-gate", "skill", 10)
     others, _, _ = weights.wins("gate-elsewhere", "skill", 10)
-    _, gains, _ = returns.wins("tipl-gate-tuned", "gain", 50)
-    best, simple = (returns.entry(name, "gain", 50) for name in ("tipl-gate-tuned", SIMPLE))
+    _, gains, _ = returns.wins("tipl-gate-stretched", "gain", 50)
+    best, simple = (returns.entry(name, "gain", 50) for name in ("tipl-gate-stretched", SIMPLE))
     return "\n".join(
         [
             "- In weight error at h = 10, `tipl-gate` beats AR(20) by phase, fitted to each task, "
@@ -77,7 +77,7 @@ def _agreement(weights: Board) -> str:
     x, y = np.array(list(found.values()), float).T
     rank = float(np.corrcoef(x.argsort().argsort(), y.argsort().argsort())[0, 1])
     in_weights, in_return = (max(found, key=lambda name: found[name][i]) for i in (0, 1))
-    stretched = sum(name.endswith("-tuned") for name in found)
+    stretched = sum(name.endswith("-stretched") for name in found)
     return (
         f"{'No' if rank < 0 else 'Partly'}: over {len(found)} forecasters, {stretched} of them "
         f"stretched, the rank correlation between mean skill and mean gain at h = 50 is "

@@ -63,7 +63,7 @@ PAGE, README = HERE.parent / "results.md", ROOT / "README.md"
 COST = HERE / "cost.json"
 OUT = Path("data/arbiter")
 
-TUNED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase")
+STRETCHED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase")
 """Forecasts that are stretched by what the returns of validation runs say, all with one grid."""
 AMPLITUDES = "0.125 0.25 0.5 1 2 4"
 PUBLISHED, PAPER_DATA = "tipl-inverted-pendulum-v4", "inverted-pendulum-v4-ppo-v1"
@@ -100,7 +100,7 @@ def plan() -> list[Step]:
         ),
         Step(name="gates", commands=tuple(gates)),
         Step(name="from TIPL to tipl-gate", commands=tuple(_ladder())),
-        Step(name="stretched forecasts", commands=tuple(_tuned())),
+        Step(name="stretched forecasts", commands=tuple(_stretched())),
         Step(
             name="evaluation",
             commands=(
@@ -139,13 +139,13 @@ def _ladder() -> Iterator[str]:
                 yield f"tipl train {kind} --data {task} --out {out} --seed {seed} {options}"
 
 
-def _tuned() -> Iterator[str]:
-    for name in TUNED:
+def _stretched() -> Iterator[str]:
+    for name in STRETCHED:
         for task in TASKS:
             along = {"tipl-gate": f"{OUT}/all/tipl-gate@0", RIVAL: f"{OUT}/{task}/ladder/{RIVAL}"}
             yield (
-                f"tipl train scaled --along {along.get(name, name)} --data {task} "
-                f"--out {OUT}/{task}/{name}-tuned --horizons 50 100 --amplitudes {AMPLITUDES} "
+                f"tipl train stretched --along {along.get(name, name)} --data {task} "
+                f"--out {OUT}/{task}/{name}-stretched --horizons 50 100 --amplitudes {AMPLITUDES} "
                 "--starts 6 --episodes 10"
             )
 
@@ -167,7 +167,7 @@ def _in_weights() -> list[str]:
 
 def _in_returns() -> list[str]:
     return [
-        *(f"{OUT}/{{data}}/{name}-tuned" for name in TUNED),
+        *(f"{OUT}/{{data}}/{name}-stretched" for name in STRETCHED),
         f"{OUT}/all/tipl-gate@0",
         f"{OUT}/{{data}}/gate-elsewhere@0",
         f"{OUT}/{{data}}/ladder/{RIVAL}",

@@ -31,13 +31,13 @@ LADDER_BATCHES = 1000
 """Number of batches of TIPL and of tipl-causal on the ladder."""
 LEARNED = (
     "tipl-gate",
-    "tipl-gate-tuned",
+    "tipl-gate-stretched",
     "gate-elsewhere",
     "ar-20-phase",
-    "ar-20-phase-tuned",
+    "ar-20-phase-stretched",
 )
 """Forecasters that are trained, and evaluated by returns."""
-SIMPLE = "last-iteration-tuned"
+SIMPLE = "last-iteration-stretched"
 """What a learned forecast has to beat in return."""
 RIVAL = "ar-20-phase"
 """What a learned forecast has to beat in weights."""
@@ -48,7 +48,7 @@ RUNGS = {
     "tipl-decayed": "+ learning rate falls, average of the weights",
     "tipl-residual": "+ predicts the step, not the position",
     "causal-first": "+ basis of the path so far, a head for each horizon",
-    "causal": "+ scaled by the steps around the start",
+    "causal": "+ sizes relative to the steps around the start",
     "gate-own": "one small network for all parameters (tipl-gate)",
     "tipl-gate": "+ trained on all seven tasks",
 }

@@ -73,7 +73,11 @@ def gain_figure(board: Board) -> Figure:
     """Draw the gain at h = 50 on each task, of the best learned forecast and of simple ones."""
     fig = Figure(figsize=(8, 3.6), layout="constrained")
     axes = fig.subplots()
-    shown = [("tipl-gate-tuned", "#c0392b"), ("tipl-gate", "#e67e22"), ("ema-0.9-tuned", "#17a589")]
+    shown = [
+        ("tipl-gate-stretched", "#c0392b"),
+        ("tipl-gate", "#e67e22"),
+        ("ema-0.9-stretched", "#17a589"),
+    ]
     for shift, (name, color) in enumerate([*shown, (SIMPLE, "#2471a3")]):
         for place, task in enumerate(TASKS):
             score = board.score(task, name, "gain", 50)

@@ -38,7 +38,7 @@ from tipl.models.baselines import (
     Steps,
 )
 from tipl.models.baselines.nowcaster import LOOP
-from tipl.models.scaled import ScaledGate
+from tipl.models.stretched import StretchedGate
 from tipl.models.tipl import TIPLConfig
 from tipl.models.tipl.network import GPT, GPTConfig
 from weighttraj.policies import load_policies
@@ -113,7 +113,7 @@ def test_baselines_with_a_fit(fit: Fit, fails: set[str], runs: list[wt.Run], fol
     assert {name for name, passed in found.passed.items() if not passed} == fails, found
 
 
-NETWORKS = [lively_gate(), lively_causal(), ScaledGate(lively_gate(), {1: 4.0, 2: 2.0, 5: 1.5})]
+NETWORKS = [lively_gate(), lively_causal(), StretchedGate(lively_gate(), {1: 4.0, 2: 2.0, 5: 1.5})]
 
 
 @pytest.mark.parametrize("forecaster", NETWORKS, ids=label)

@@ -18,7 +18,7 @@ import weighttraj as wt
 from tipl.models.baselines import WNN, NinoMLP, Reconstruction, Regression
 from tipl.models.baselines.nowcaster import Nowcaster, NowcasterConfig
 from tipl.models.baselines.train import FEATURES
-from tipl.models.scaled import Scaled
+from tipl.models.stretched import Stretched
 from tipl.registry import unfitted
 
 REFERENCE = json.loads(Path(__file__).with_name("reference.json").read_text())
@@ -82,7 +82,7 @@ def test_small_networks(kind: type[Nowcaster], run: wt.Run) -> None:
     assert_held(f"drawn {model.name}", model.forecast(run, STARTS, HORIZONS))
 
 
-def test_scaled_forecasts_and_the_oracle(run: wt.Run) -> None:
-    scaled = Scaled(tipl.load("ema-0.9"), {1: 2.0, 50: 0.5})
-    assert_held("further ema-0.9", scaled.forecast(run, STARTS, HORIZONS))
+def test_stretched_forecasts_and_the_oracle(run: wt.Run) -> None:
+    stretched = Stretched(tipl.load("ema-0.9"), {1: 2.0, 50: 0.5})
+    assert_held("stretched ema-0.9", stretched.forecast(run, STARTS, HORIZONS))
     assert_held("reconstruction-32", Reconstruction(32).forecast(run, STARTS, HORIZONS))

@@ -168,8 +168,8 @@ def test_sentences_say_what_was_done_found_and_how_sure_it_is(many: dict[str, An
     ("name", "shift", "said"),
     [
         ("base", 0.495, "these runs do not show which one gains more."),
-        ("base-further", 0.495, "these runs do not show which one gains more."),
-        ("base-further", 0.2, None),
+        ("base-stretched", 0.495, "these runs do not show which one gains more."),
+        ("base-stretched", 0.2, None),
     ],
 )
 def test_a_baseline_that_gains_as_much_is_named(

@@ -19,7 +19,7 @@ from tests.tipl.lively import lively_causal, lively_gate
 from tipl.errors import ModelError
 from tipl.models.baselines import WNN, Ema, Extrapolation
 from tipl.models.baselines.nowcaster import NowcasterConfig
-from tipl.models.scaled import ScaledGate
+from tipl.models.stretched import StretchedGate
 from tipl.models.tipl import GPT, TIPL, GPTConfig, TIPLConfig
 from tipl.registry import load
 from tipl.saved import read_arrays
@@ -30,7 +30,7 @@ MAKERS: dict[str, Callable[[], tipl.Forecaster]] = {
     "tipl": lambda: TIPL(GPT(GPT_SIZES), TIPLConfig(gpt=GPT_SIZES, every=2)),
     "gate": lively_gate,
     "causal": lively_causal,
-    "scaled": lambda: ScaledGate(lively_gate(), {1: 2.0, 2: 1.0, 5: 1.0}),
+    "stretched": lambda: StretchedGate(lively_gate(), {1: 2.0, 2: 1.0, 5: 1.0}),
     "wnn": lambda: WNN(WNN.build(NOWCASTER), NOWCASTER),
 }
 
@@ -60,7 +60,7 @@ def changed(folder: Path, path: tuple[str, ...], value: object) -> None:
         ("gate", ("network", "experts")),
         ("causal", ("network", "rank")),
         ("causal", ("network", "n_layer")),
-        ("scaled", ("network", "phases")),
+        ("stretched", ("network", "phases")),
         ("wnn", ("width",)),
         ("wnn", ("context",)),
     ],

@@ -33,7 +33,7 @@ from tipl.errors import EvaluateError, ForecastError, ModelError
 from tipl.evaluation.results import read_results
 from tipl.models.baselines import Extrapolation, Slope
 from tipl.models.gate import GateTrainConfig, train_gate
-from tipl.models.scaled import Scaled
+from tipl.models.stretched import Stretched
 from tipl.models.tipl import TIPLConfig
 from tipl.models.tipl.network import GPT, GPTConfig
 from tipl.registry import MODELS, names, unfitted
@@ -233,10 +233,10 @@ def test_what_lies_in_the_zoo_can_be_judged_anew(
 
 
 def test_what_goes_along_another_is_released_with_it(zoo: Path, tmp_path: Path) -> None:
-    Scaled(Extrapolation(Slope(5)), {1: 2.0}).save(tmp_path / "further")
-    release(tmp_path / "further", "trend-5-further")
-    found = load("trend-5-further")
-    assert isinstance(found, Scaled)
+    Stretched(Extrapolation(Slope(5)), {1: 2.0}).save(tmp_path / "further")
+    release(tmp_path / "further", "trend-5-stretched")
+    found = load("trend-5-stretched")
+    assert isinstance(found, Stretched)
     assert (found.along, found.amplitudes) == (Extrapolation(Slope(5)), {1: 2.0})
 
 
@@ -381,7 +381,7 @@ def test_the_card_of_amplitudes_shows_what_chose_them(
     assert "![" not in training
     _, gate, drift, judged, _ = commands.splitlines()
     assert gate == "tipl train gate --data small --out GATE --width 16 --horizons 1 5"
-    assert drift == "tipl train scaled --along GATE --data small --out FOLDER --episodes 3"
+    assert drift == "tipl train stretched --along GATE --data small --out FOLDER --episodes 3"
     assert judged == metrics.results.command
 
 
@@ -389,12 +389,12 @@ def test_the_commands_make_the_baselines_first(trained: Path, zoo: Path, results
     release(trained, "tipl-small", results=results)
     metrics = metrics_of("tipl-small")
     command = (
-        "tipl evaluate tipl-small ema-0.9 a/persistence a/ema-0.9 b/ema-0.9-further --data small"
+        "tipl evaluate tipl-small ema-0.9 a/persistence a/ema-0.9 b/ema-0.9-stretched --data small"
     )
     found = replace(metrics, results=msgspec.structs.replace(metrics.results, command=command))
     *_, first, second, judged, _ = facts(found, "commands").splitlines()
     assert first == "tipl train baselines --data small --out a"
-    assert second == "tipl train scaled --along a/ema-0.9 --data small --out b/ema-0.9-further"
+    assert second == "tipl train stretched --along a/ema-0.9 --data small --out b/ema-0.9-stretched"
     assert judged == command
 
 

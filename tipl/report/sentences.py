@@ -19,8 +19,8 @@ from tipl.report.tables import cell, label
 
 NEAR = (1, 10)
 """Horizons at which skills are told, where these were measured."""
-STRETCHED = ("-further", "-tuned")
-"""Ends of the names of baselines whose displacement is stretched by a factor, chosen by returns."""
+STRETCHED = "-stretched"
+"""End of the names of baselines whose displacement is stretched by a factor, chosen by returns."""
 TOLD = 3
 """Number of the best baselines that are described where there is no model."""
 

@@ -182,7 +182,7 @@ def _commands(metrics: Metrics) -> str:
         of_network, of_amplitudes = given.values()
         commands += [
             f"tipl train gate --data {data} --out GATE {of_network}",
-            f"tipl train scaled --along GATE --data {data} --out FOLDER {of_amplitudes}",
+            f"tipl train stretched --along GATE --data {data} --out FOLDER {of_amplitudes}",
         ]
     elif metrics.trained_on and kind is not None and kind.command:
         commands.append(f"tipl train {kind.command} --data {data} --out FOLDER {given['']}")
@@ -200,7 +200,7 @@ def _fits(metrics: Metrics) -> Iterator[str]:
     for folder in read:
         along = folder.name.rpartition("-")[0]
         if folder.name.endswith(STRETCHED) and ladders:
-            yield f"tipl train scaled --along {ladders[0] / along} --data {data} --out {folder}"
+            yield f"tipl train stretched --along {ladders[0] / along} --data {data} --out {folder}"
 
 
 def _option(setting: tuple[str, Any]) -> str:

@@ -1,8 +1,9 @@
 """Published ways to go on from the path so far, each as one direction v_t per snapshot.
 
-``Extrapolation`` makes a forecast of each, phi_t + h v_t, and ``scaled`` stretches it by what the
-returns of validation runs say. Most of these papers train language models and choose directions by
-tensor over whole trainings; here each sees the last snapshots before the start and nothing else.
+``Extrapolation`` makes a forecast of each, phi_t + h v_t, and ``tipl.models.stretched`` stretches
+it by what the returns of validation runs say. Most of these papers train language models and choose
+directions by tensor over whole trainings; here each sees the last snapshots before the start and
+nothing else.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ def iteration_length(trajectory: Trajectory, t: int) -> int:
 class LastIteration(Features):
     """The change over the last iteration of PPO, per snapshot.
 
-    Stretched by ``scaled``, this is "last iteration x alpha": the rival that a public replication
-    of RELEX found level with the end of a training ("the first update times 1000"). Moving on by a
-    multiple of each iteration's change is also the outer step of Nichol et al., "On First-Order
-    Meta-Learning Algorithms" (arXiv:1803.02999), and of outer-PPO.
+    Stretched (``tipl train stretched``), this is "last iteration x alpha": the rival that a public
+    replication of RELEX found level with the end of a training ("the first update times 1000").
+    Moving on by a multiple of each iteration's change is also the outer step of Nichol et al., "On
+    First-Order Meta-Learning Algorithms" (arXiv:1803.02999), and of outer-PPO.
     """
 
     kind = "last-iteration"
@@ -118,7 +119,7 @@ class LeadingDirections(Features):
     After Policy Path Trimming and Boosting, PPTB, of "The Ladder in Chaos" (Tang et al.,
     NeurIPS 2024), from which Temporal SVD comes: the minor directions of the path are trimmed and
     the major ones boosted. Ours: trimmed of the change and not of the weights, whose minor
-    directions hold what a policy was initialised with; ``scaled`` boosts.
+    directions hold what a policy was initialised with; ``stretched`` boosts.
     """
 
     window: int = 50

@@ -1,4 +1,4 @@
-"""Scaled forecasts: the displacement of another forecaster, times a factor for each horizon."""
+"""Stretched forecasts: the displacement of another forecaster, times a factor for each horizon."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from weighttraj import ParamLayout, Run
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaledGateConfig(ModelConfig[GateConfig]):
+class StretchedGateConfig(ModelConfig[GateConfig]):
     """What a saved one says of itself."""
 
     amplitudes: dict[str, float]
@@ -29,7 +29,7 @@ class ScaledGateConfig(ModelConfig[GateConfig]):
 
 
 @dataclass(frozen=True, eq=False)
-class ScaledGate(Forecaster):
+class StretchedGate(Forecaster):
     """phi_t + a_h d_h: the displacement d_h that tipl-gate forecasts, a_h times as long.
 
     A least-squares forecast is short, because it is the mean of the many ways that training may go.
@@ -39,7 +39,7 @@ class ScaledGate(Forecaster):
     """
 
     gate: Gate
-    """The forecaster whose displacement is scaled."""
+    """The forecaster whose displacement is stretched."""
     amplitudes: dict[int, float]
     """Factor a_h of each horizon."""
     name: str = "tipl-drift"
@@ -49,7 +49,7 @@ class ScaledGate(Forecaster):
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and the scaled displacement."""
+        """Return phi_t and the stretched displacement."""
         rows_of(list(self.amplitudes), horizons, self.name)
         factors = _factors(run.layout, [self.amplitudes[h] for h in horizons])
         out = np.empty((len(starts), *factors.shape), np.float32)
@@ -64,9 +64,9 @@ class ScaledGate(Forecaster):
         save_file(self.gate.network.state_dict(), Path(path) / ARRAYS)
 
     @classmethod
-    def load(cls, path: str | Path) -> ScaledGate:
+    def load(cls, path: str | Path) -> StretchedGate:
         """Read a saved one; every parameter must be there."""
-        config = read_config(path, cls.kind, ScaledGateConfig)
+        config = read_config(path, cls.kind, StretchedGateConfig)
         known = {str(h): h for h in config.network.horizons}
         if not config.amplitudes.keys() <= known.keys():
             raise broken(
@@ -79,22 +79,22 @@ class ScaledGate(Forecaster):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaledConfig:
-    """What a saved one says of itself; the scaled forecaster is in a folder beside it."""
+class StretchedConfig:
+    """What a saved one says of itself; the stretched forecaster is in a folder beside it."""
 
     amplitudes: dict[str, float]
     """Factor of the displacement at each horizon."""
 
 
 @dataclass(frozen=True, eq=False)
-class Scaled(Forecaster):
-    """phi_t and a_h times the displacement of any other forecaster: the rivals of ``ScaledGate``.
+class Stretched(Forecaster):
+    """phi_t and a_h times the displacement of a forecaster other than tipl-gate.
 
     Between the horizons that amplitudes were chosen for, they are interpolated linearly in log h.
     """
 
     along: Forecaster
-    """The forecaster whose displacement is scaled."""
+    """The forecaster whose displacement is stretched."""
     amplitudes: dict[int, float]
     """Factor a_h of some horizons."""
     name: str = "further"
@@ -103,13 +103,13 @@ class Scaled(Forecaster):
 
     @property
     def causal(self) -> bool:
-        """Whether the forecaster that it scales is causal."""
+        """Whether the forecaster that it stretches is causal."""
         return self.along.causal
 
     def forecast(
         self, run: Run, starts: Sequence[int], horizons: Sequence[int]
     ) -> Float32[np.ndarray, "start horizon param"]:
-        """Return phi_t and the scaled displacement."""
+        """Return phi_t and the stretched displacement."""
         check_request(run, starts, horizons)
         now = weights_of(run)[np.asarray(starts)][:, None]
         moved = self.along.forecast(run, starts, horizons) - now
@@ -118,15 +118,15 @@ class Scaled(Forecaster):
         return np.asarray(now + _factors(run.layout, chosen.tolist()) * moved)
 
     def save(self, path: str | Path) -> None:
-        """Write config.json, and the scaled forecaster into a folder beside it."""
+        """Write config.json, and the stretched forecaster into a folder beside it."""
         amplitudes = {str(h): a for h, a in self.amplitudes.items()}
         write(path, {"kind": self.kind, "amplitudes": amplitudes})
         self.along.save(Path(path) / _ALONG)
 
     @classmethod
-    def load(cls, path: str | Path) -> Scaled:
+    def load(cls, path: str | Path) -> Stretched:
         """Read a saved one."""
-        config = read_config(path, cls.kind, ScaledConfig)
+        config = read_config(path, cls.kind, StretchedConfig)
         if not config.amplitudes or not all(h.isdecimal() and int(h) for h in config.amplitudes):
             raise broken(path, f"amplitudes of {sorted(config.amplitudes)}, not of horizons")
         amplitudes = {int(h): a for h, a in config.amplitudes.items()}

@@ -15,8 +15,8 @@ from tipl.checks.model import refit_of
 from tipl.errors import EvaluateError, ForecastError, ModelError, TrainError
 from tipl.evaluation.returns import Player
 from tipl.evaluation.starts import learning_phase
-from tipl.models.scaled import Scaled, ScaledGate, ScaledTrainConfig, train_scaled
-from tipl.models.scaled.train import gains_of
+from tipl.models.stretched import Stretched, StretchedGate, StretchedTrainConfig, train_stretched
+from tipl.models.stretched.train import gains_of
 from tipl.registry import load
 from weighttraj.policies import load_policies
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info
@@ -39,17 +39,17 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def config(data: Path) -> ScaledTrainConfig:
+def config(data: Path) -> StretchedTrainConfig:
     lively_gate(64).save(data.with_name("gate"))
-    return ScaledTrainConfig(
+    return StretchedTrainConfig(
         along=data.with_name("gate"), data=data, out=data.with_name("model"), horizons=(1, 5),
         amplitudes=(0.5, 1, 8), starts=3, episodes=5,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def trained(config: ScaledTrainConfig) -> ScaledGate:
-    return train_scaled(config)
+def trained(config: StretchedTrainConfig) -> StretchedGate:
+    return train_stretched(config)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_it_goes_further_along_the_gates_way(run: wt.Run) -> None:
     gate, starts, horizons = lively_gate(64), [3, 30], [5, 1]
     now = run.weights[starts][:, None].astype(np.float64)
     short = gate.forecast(run, starts, horizons) - now
-    long = ScaledGate(gate, AMPLITUDES).forecast(run, starts, horizons) - now
+    long = StretchedGate(gate, AMPLITUDES).forecast(run, starts, horizons) - now
     factors = np.array([[1.5], [4.0]]) * np.ones(run.layout.size)
     factors[:, run.layout["log_std"].slice] = 1  # the noise moves as the gate says
     np.testing.assert_allclose(long, factors * short, atol=1e-6)
@@ -79,11 +79,11 @@ def test_it_goes_further_along_the_gates_way(run: wt.Run) -> None:
 
 def test_a_horizon_without_amplitude_is_refused(run: wt.Run) -> None:
     with pytest.raises(ForecastError, match="not fitted for this horizon"):
-        ScaledGate(lively_gate(64), {1: 2.0}).forecast(run, [3], [5])
+        StretchedGate(lively_gate(64), {1: 2.0}).forecast(run, [3], [5])
 
 
 def test_it_is_saved_and_loaded(run: wt.Run, tmp_path: Path) -> None:
-    drift = ScaledGate(lively_gate(64), AMPLITUDES)
+    drift = StretchedGate(lively_gate(64), AMPLITUDES)
     drift.save(tmp_path / "copy")
     again = load(tmp_path / "copy")
     assert again.name == "copy"
@@ -92,15 +92,15 @@ def test_it_is_saved_and_loaded(run: wt.Run, tmp_path: Path) -> None:
     file = tmp_path / "copy/config.json"
     file.write_text(file.read_text().replace('"5": 1.5', '"7": 1.5'))
     with pytest.raises(ModelError, match="amplitudes of horizons"):
-        ScaledGate.load(tmp_path / "copy")
+        StretchedGate.load(tmp_path / "copy")
 
 
 def test_it_is_fitted_to_walks_with_its_amplitudes(short: wt.Run, tmp_path: Path) -> None:
     config = RefitConfig(folder=tmp_path, horizons=(1, 5, 9), batches=5)
-    fit = refit_of(ScaledGate(lively_gate(64), AMPLITUDES), config)
+    fit = refit_of(StretchedGate(lively_gate(64), AMPLITUDES), config)
     assert fit is not None
     again = fit(random_walks(short, tmp_path, count=4))
-    assert isinstance(again, ScaledGate)
+    assert isinstance(again, StretchedGate)
     assert again.amplitudes == {1: 4.0, 5: 1.5}
 
 
@@ -110,7 +110,7 @@ def test_it_is_fitted_to_walks_with_its_amplitudes(short: wt.Run, tmp_path: Path
 def test_any_other_forecast_is_followed_too(run: wt.Run, tmp_path: Path) -> None:
     slope, starts, horizons = load("trend-5"), [9, 30], [1, 5, 25]
     now = run.weights[starts][:, None].astype(np.float64)
-    rival = Scaled(slope, {1: 4.0, 25: 2.0})
+    rival = Stretched(slope, {1: 4.0, 25: 2.0})
     between = 3.0  # 5 lies half-way between 1 and 25 in log h
     factors = np.array([[4.0], [between], [2.0]]) * np.ones(run.layout.size)
     factors[:, run.layout["log_std"].slice] = 1
@@ -129,23 +129,23 @@ def test_any_other_forecast_is_followed_too(run: wt.Run, tmp_path: Path) -> None
         load(tmp_path / "rival")
 
 
-def test_how_far_a_rival_goes_is_chosen_as_for_the_gate(config: ScaledTrainConfig) -> None:
+def test_how_far_a_rival_goes_is_chosen_as_for_the_gate(config: StretchedTrainConfig) -> None:
     name = "trend-5"
-    rival = train_scaled(replace(config, along=name, out=config.out.with_name("rival")))
-    assert isinstance(rival, Scaled)
+    rival = train_stretched(replace(config, along=name, out=config.out.with_name("rival")))
+    assert isinstance(rival, Stretched)
     lines = (config.out.with_name("rival") / "log.jsonl").read_text().splitlines()
     best = max(map(json.loads, lines), key=lambda line: line["gain_5"])
     assert rival.amplitudes[5] == best["amplitude"]
     assert load(config.out.with_name("rival")).name == "rival"
     with pytest.raises(ForecastError, match="no such forecaster"):
-        train_scaled(replace(config, along="tomorrow", out=config.out.with_name("none")))
+        train_stretched(replace(config, along="tomorrow", out=config.out.with_name("none")))
 
 
 # The choice
 
 
 def test_amplitudes_are_those_of_the_highest_gain(
-    trained: ScaledGate, config: ScaledTrainConfig, data: Path
+    trained: StretchedGate, config: StretchedTrainConfig, data: Path
 ) -> None:
     lines = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
     assert [line["amplitude"] for line in lines] == [0.5, 1, 8]
@@ -161,7 +161,7 @@ def test_amplitudes_are_those_of_the_highest_gain(
             continue
         end = min(learning_phase(run), len(run) - 1 - 5 - 1)
         starts = np.linspace(min(10, end // 4), end, 5)[1:-1].round().astype(int)
-        drift = ScaledGate(lively_gate(64), dict.fromkeys(HORIZONS, 8.0))
+        drift = StretchedGate(lively_gate(64), dict.fromkeys(HORIZONS, 8.0))
         forecast = drift.forecast(run, starts.tolist(), [5])[:, 0]
         with Player(run, 5, 0, modes=("held",)) as player:
             (now,) = player.returns(load_policies(run, starts), starts)
@@ -179,26 +179,26 @@ def test_a_run_that_gains_more_counts_more() -> None:
 
 
 def test_what_was_measured_is_not_measured_again(
-    trained: ScaledGate, config: ScaledTrainConfig, monkeypatch: pytest.MonkeyPatch
+    trained: StretchedGate, config: StretchedTrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def never(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("tipl.models.scaled.train._measure", never)
-    assert train_scaled(config).amplitudes == trained.amplitudes
+    monkeypatch.setattr("tipl.models.stretched.train._measure", never)
+    assert train_stretched(config).amplitudes == trained.amplitudes
     with pytest.raises(TrainError, match="other settings"):
-        train_scaled(replace(config, episodes=6))
+        train_stretched(replace(config, episodes=6))
 
 
 def test_what_it_needs_is_said(
-    config: ScaledTrainConfig, small_dataset: Path, tmp_path: Path
+    config: StretchedTrainConfig, small_dataset: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(TrainError, match="runs in the validation split"):
-        train_scaled(replace(config, data=small_dataset, out=tmp_path / "a"))
+        train_stretched(replace(config, data=small_dataset, out=tmp_path / "a"))
     with pytest.raises(TrainError, match="factors above 0"):
-        train_scaled(replace(config, amplitudes=(0, 1), out=tmp_path / "b"))
+        train_stretched(replace(config, amplitudes=(0, 1), out=tmp_path / "b"))
     with pytest.raises(ForecastError, match="not fitted for this horizon"):
-        train_scaled(replace(config, horizons=(3,), out=tmp_path / "c"))
+        train_stretched(replace(config, horizons=(3,), out=tmp_path / "c"))
     still = {"forecast": np.ones((2, 1)), "training": np.zeros(1)}
     with pytest.raises(TrainError, match="training adds nothing"):
         gains_of([still])
@@ -208,4 +208,4 @@ def test_what_it_needs_is_said(
     runs = [replace(run, split="validation") for run in info.runs]
     write_dataset_info(bare, replace(info, runs=tuple(runs)))
     with pytest.raises(EvaluateError, match="weighttraj returns"):
-        train_scaled(replace(config, data=bare, out=tmp_path / "d"))
+        train_stretched(replace(config, data=bare, out=tmp_path / "d"))

@@ -1,4 +1,4 @@
-"""Chooses the factors of a scaled forecast, by returns of forecast policies on validation runs."""
+"""Chooses the factors of a stretched forecast by returns of its policies on validation runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tipl.forecaster import Forecaster
 from tipl.horizons import fitted, rows_of
 from tipl.models.gate.forecaster import Gate
 from tipl.models.gate.train import refit as refit_gate
-from tipl.models.scaled.forecaster import Scaled, ScaledGate
+from tipl.models.stretched.forecaster import Stretched, StretchedGate
 from tipl.registry import load
 from tipl.runs import checksum_of, fault_of, weights_of, without_faults
 from tipl.saved import fingerprint
@@ -41,11 +41,11 @@ MODE = "held"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaledTrainConfig:
+class StretchedTrainConfig:
     """What is stretched, what chooses, and where the model goes."""
 
     along: str | Path
-    """Forecaster to scale: the folder of a trained tipl-gate, or another forecaster by folder or
+    """Forecaster to stretch: the folder of a trained tipl-gate, or another forecaster by folder or
     name."""
     data: str | Path
     """Data set: a path or an id. Its validation runs, which need returns, choose."""
@@ -75,19 +75,19 @@ class ScaledTrainConfig:
             )
 
 
-def train_scaled(
-    config: ScaledTrainConfig, *, console: Console | None = None
-) -> ScaledGate | Scaled:
+def train_stretched(
+    config: StretchedTrainConfig, *, console: Console | None = None
+) -> StretchedGate | Stretched:
     """Stretch a model's forecasts: choose for each horizon the factor that gains most return.
 
     The inference gain on validation runs decides: how much the forecast adds to the return, as a
     share of what training adds until then, summed over starts and runs. At equal gain the smaller
     factor is taken. Policies are evaluated in the environment, which takes minutes.
 
-    Example: tipl train scaled --along tipl-gate --data hopper-v4-ppo-16x16-v1 --out data/stretched
+    Example: tipl train stretched --along tipl-gate --data hopper-v4-ppo-16x16-v1 --out data/mine
 
     Returns:
-        A ``ScaledGate`` if a tipl-gate is scaled, else a ``Scaled``.
+        A ``StretchedGate`` if a tipl-gate is stretched, else a ``Stretched``.
 
     Raises:
         TrainError: there are no validation runs, or they do not learn; there are no factors; or the
@@ -105,8 +105,8 @@ def train_scaled(
     measured = _measure_all(config, along, runs, settings, console or Console(quiet=True))
     gains, factors = gains_of(measured), sorted(config.amplitudes)
     best = [factors[row] for row in np.argmax(gains, axis=0)]
-    scaled = _scaled(along, dict(zip(horizons, best, strict=True)), config.out.name)
-    scaled.save(config.out)
+    stretched = _stretched(along, dict(zip(horizons, best, strict=True)), config.out.name)
+    stretched.save(config.out)
     lines = [
         {"amplitude": factor} | {f"gain_{h}": gain for h, gain in zip(horizons, row, strict=True)}
         for factor, row in zip(factors, gains.tolist(), strict=True)
@@ -114,11 +114,11 @@ def train_scaled(
     (config.out / "log.jsonl").write_text(
         "".join(f"{json.dumps(line)}\n" for line in lines), encoding="utf-8"
     )
-    return scaled
+    return stretched
 
 
 def _measure_all(
-    config: ScaledTrainConfig,
+    config: StretchedTrainConfig,
     along: Forecaster,
     runs: Sequence[wt.Run],
     settings: dict[str, Any],
@@ -140,7 +140,7 @@ def _measure_all(
 
 
 def _settings(
-    config: ScaledTrainConfig, along: Forecaster, runs: Sequence[wt.Run]
+    config: StretchedTrainConfig, along: Forecaster, runs: Sequence[wt.Run]
 ) -> dict[str, Any]:
     """Return what train.json says of the choice."""
     return flat(config) | {
@@ -170,15 +170,15 @@ def gains_of(measured: Sequence[Arrays]) -> Float64[np.ndarray, "amplitude horiz
     return gains
 
 
-def _scaled(
-    along: Forecaster, amplitudes: dict[int, float], name: str = "scaled"
-) -> ScaledGate | Scaled:
-    """Return a scaled forecast; between these horizons, amplitudes are linear in log h."""
+def _stretched(
+    along: Forecaster, amplitudes: dict[int, float], name: str = "stretched"
+) -> StretchedGate | Stretched:
+    """Return a stretched forecast; between these horizons, amplitudes are linear in log h."""
     if not isinstance(along, Gate):
-        return Scaled(along, amplitudes, name)
+        return Stretched(along, amplitudes, name)
     known = along.config.network.horizons
     every = np.interp(np.log(known), np.log(list(amplitudes)), list(amplitudes.values()))
-    return ScaledGate(along, dict(zip(known, every.tolist(), strict=True)), name)
+    return StretchedGate(along, dict(zip(known, every.tolist(), strict=True)), name)
 
 
 def _trained_on(along: Path) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def _source(settings: dict[str, Any], run: wt.Run) -> dict[str, Any]:
     return {name: settings[name] for name in ours} | run_source(run)
 
 
-def _measure(along: Forecaster, run: wt.Run, config: ScaledTrainConfig) -> Arrays:
+def _measure(along: Forecaster, run: wt.Run, config: StretchedTrainConfig) -> Arrays:
     horizons = fitted(config.horizons)
     protocol = EvaluateConfig(
         data=config.data,
@@ -229,17 +229,17 @@ def _measure(along: Forecaster, run: wt.Run, config: ScaledTrainConfig) -> Array
         now = true["now"][0, :, None]
         added = []
         for factor in sorted(config.amplitudes):
-            scaled = _scaled(along, dict.fromkeys(horizons, factor))
-            found = forecast_returns(scaled, player, run, starts, horizons, quiet)["forecast"][0]
+            stretched = _stretched(along, dict.fromkeys(horizons, factor))
+            found = forecast_returns(stretched, player, run, starts, horizons, quiet)["forecast"][0]
             added.append((found - now).sum(0))
     return {"forecast": np.stack(added), "training": (true["later"][0] - now).sum(0)}
 
 
-def refit(old: ScaledGate, runs: Sequence[wt.Run], config: RefitConfig) -> ScaledGate:
+def refit(old: StretchedGate, runs: Sequence[wt.Run], config: RefitConfig) -> StretchedGate:
     """Train another gate on other runs, for the null check; the amplitudes stay the same.
 
     Random walks have no returns to choose others by.
     """
     horizons = tuple(h for h in config.horizons if h in old.amplitudes)
     gate = refit_gate(old.gate, runs, replace(config, horizons=horizons))
-    return ScaledGate(gate, {h: old.amplitudes[h] for h in horizons})
+    return StretchedGate(gate, {h: old.amplitudes[h] for h in horizons})
