@@ -40,7 +40,7 @@ from tipl.registry import MODELS, names, unfitted
 from tipl.report.markdown import places
 from tipl.report.scores import SKILL
 from tipl.saved import fingerprint
-from tipl.zoo.card import facts, metrics_of, refreshed, write_card
+from tipl.zoo.card import facts, metrics_of, ranges, refreshed, write_card
 from tipl.zoo.metrics import read_metrics
 from tipl.zoo.release import LINES, MOST, release, task_scores, thinned
 from weighttraj.store.catalog import read_dataset_info, write_dataset_info
@@ -385,6 +385,19 @@ def test_the_card_of_amplitudes_shows_what_chose_them(
     assert judged == metrics.results.command
 
 
+@pytest.mark.parametrize(
+    ("runs", "told"),
+    [
+        ([f"seed{n:04}" for n in range(8, 12)], "seed0008 to seed0011"),
+        (["seed0", "seed1", "seed3", "seed4", "seed5"], "seed0, seed1, seed3 to seed5"),
+        (["a", "b", "seed1", "run2", "run3", "run5"], "a, b, seed1, run2, run3, run5"),
+        ([], ""),
+    ],
+)
+def test_successive_runs_are_told_as_ranges(runs: list[str], told: str) -> None:
+    assert ranges(runs) == told
+
+
 def test_the_commands_make_the_baselines_first(trained: Path, zoo: Path, results: Path) -> None:
     release(trained, "tipl-small", results=results)
     metrics = metrics_of("tipl-small")
@@ -473,6 +486,7 @@ def test_a_gate_is_released_with_its_data_sets(
         task_scores("tipl-gate", [rows])
     assert 'datasets:\n- "small"\n- "other"\n' in text
     assert text.count("- trained on: ") == 2
+    assert text.count("- cadence: a snapshot every ") == 1
     assert "tipl train gate --data small other --out FOLDER --starts 20 --n-batches 4" in text
     assert " --horizons 1 5 " in text
     assert "None" not in text

@@ -15,7 +15,8 @@ section has its own heading, so that what was not measured leaves no empty one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,11 +117,32 @@ def facts(metrics: Metrics, section: str) -> str:
         "tests": _TESTS,
         "headline": headline,
         "measured": _measured,
+        "ranges": ranges,
         "cell": cell,
         "table_lines": table_lines,
         "findings": findings,
     }
     return section_of("facts.md", section, context)
+
+
+def ranges(runs: Sequence[str]) -> str:
+    """Return ids of runs, in order, with three or more successive numbers as first to last."""
+    found: list[list[str]] = []
+    for run in runs:
+        if found and run == _successor(found[-1][-1]):
+            found[-1].append(run)
+        else:
+            found.append([run])
+    texts = [f"{some[0]} to {some[-1]}" if len(some) > 2 else ", ".join(some) for some in found]
+    return ", ".join(texts)
+
+
+def _successor(run: str) -> str | None:
+    """Return the id with the next number: seed0009, seed0010; None: it ends without a number."""
+    number = re.search(r"\d+$", run)
+    if number is None:
+        return None
+    return f"{run[: number.start()]}{int(number[0]) + 1:0{len(number[0])}d}"
 
 
 def training_figure(metrics: Metrics) -> Figure:
@@ -195,7 +217,9 @@ def _fits(metrics: Metrics) -> Iterator[str]:
     words = metrics.results.command.split()
     read = [Path(word) for word in words[2 : words.index("--data")]] if "--data" in words else []
     data = metrics.results.data
-    ladders = [folder.parent for folder in read if folder.name == PERSISTENCE != str(folder)]
+    # Every folder of fitted baselines has both of these.
+    fitted = [f for f in read if f.name in (PERSISTENCE, "ar-20-phase") and str(f) != f.name]
+    ladders = list(dict.fromkeys(folder.parent for folder in fitted))
     yield from (f"tipl train baselines --data {data} --out {ladder}" for ladder in ladders)
     for folder in read:
         along = folder.name.rpartition("-")[0]
