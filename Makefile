@@ -31,7 +31,7 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	cp $(DEMO)/report/results.json datasets/demo/results.json
 	$(BIN)/tipl report datasets/demo/results.json --into README.md
 	$(BIN)/tipl report datasets/demo/results.json --into docs/quickstart.md
-	$(BIN)/python docs/results/arbiter.py
+	$(BIN)/python docs/results/make_results.py
 	$(BIN)/tipl report docs/studies/live/test/results.json --into README.md
 	$(BIN)/tipl report docs/studies/live/test/results.json --into docs/live.md
 	$(BIN)/tipl report docs/studies/live/tuning/results.json --into docs/live.md
@@ -72,7 +72,7 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python tests/benchmarks/results.py
 
 results: setup ## say what it costs, then train and evaluate every forecaster, and write docs/results.md
-	$(BIN)/python docs/results/arbiter.py --run
+	$(BIN)/python docs/results/make_results.py --run
 
 stress: setup ## kill, flip, delete, fuzz: about an hour
 	$(BIN)/python -W ignore tests/benchmarks/stress_format.py

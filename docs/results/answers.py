@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from board import LADDER_BATCHES, LEARNED, RUNGS, SEEDS, SIMPLE, TASKS, Board, ladder_tasks
+from board import ABLATION_BATCHES, LEARNED, SEEDS, SIMPLE, TASKS, VARIANTS, Board, ablation_tasks
 from result_tables import cell
 
 from tipl.evaluation.rows import TaskRow
@@ -104,28 +104,28 @@ def _paper(weights: Board) -> str:
     skills = {
         name: [
             s.score.value
-            for task in ladder_tasks(weights)
+            for task in ablation_tasks(weights)
             if (s := weights.score(task, name, "skill", 1)) is not None
             and s.score.value is not None
         ]
-        for name in RUNGS
+        for name in VARIANTS
     }
     means = {name: float(np.mean(values)) for name, values in skills.items() if values}
-    order = [name for name in RUNGS if name in means]
+    order = [name for name in VARIANTS if name in means]
     tasks = len(skills[order[0]])
     jumps = {b: means[b] - means[a] for a, b in pairwise(order)}
     largest = max(jumps, key=lambda name: jumps[name])
     crossed = next((name for name in order if means[name] > 0), None)
     text = (
-        f"TIPL's design, trained for {LADDER_BATCHES:,} batches (the paper: 500,000), has skill "
+        f"TIPL's design, trained for {ABLATION_BATCHES:,} batches (the paper: 500,000), has skill "
         f"{means[order[0]]:,.0f} at h = 1 on average over {tasks} tasks. The change that helps "
-        f"most is “{RUNGS[largest].lstrip('+ ')}”."
+        f"most is “{VARIANTS[largest].lstrip('+ ')}”."
     )
     if crossed:
         place = order.index(crossed) + 1
         text += (
             f" At h = 1, models are better than persistence from line {place} of the "
-            f"table on: “{RUNGS[crossed].lstrip('+ ')}”."
+            f"table on: “{VARIANTS[crossed].lstrip('+ ')}”."
         )
     return text
 

@@ -12,7 +12,7 @@ from tipl.evaluation.rows import TaskRow, read_rows
 HERE = Path(__file__).parent
 ROWS, PAPER = HERE / "rows", HERE / "paper.json"
 
-LADDER = ("HalfCheetah", "Hopper", "InvertedPendulum")
+ABLATION = ("HalfCheetah", "Hopper", "InvertedPendulum")
 TASKS = {
     "half-cheetah-v4-ppo-16x16-v1": "HalfCheetah",
     "hopper-v4-ppo-16x16-v1": "Hopper",
@@ -23,12 +23,12 @@ TASKS = {
     "inverted-pendulum-v4-ppo-v1": "InvertedPendulum",
 }
 """Data sets of this repository."""
-LADDER_TASKS = tuple(task for task in TASKS if TASKS[task] in LADDER)
-"""Tasks of the ladder from TIPL to tipl-gate."""
-SEEDS, LADDER_SEEDS = (0, 1, 2), (0,)
+ABLATION_TASKS = tuple(task for task in TASKS if TASKS[task] in ABLATION)
+"""Tasks of the ablation from TIPL to tipl-gate."""
+SEEDS, ABLATION_SEEDS = (0, 1, 2), (0,)
 """Seeds of the trainings."""
-LADDER_BATCHES = 1000
-"""Number of batches of TIPL and of tipl-causal on the ladder."""
+ABLATION_BATCHES = 1000
+"""Number of batches of TIPL and of tipl-causal on the ablation."""
 LEARNED = (
     "tipl-gate",
     "tipl-gate-stretched",
@@ -43,7 +43,7 @@ RIVAL = "ar-20-phase"
 """What a learned forecast has to beat in weights."""
 PAPER_SPLITS = {"train": "training runs", "test": "test runs"}
 """The paper names no held-out runs: TIPL is evaluated on the runs it was trained on as well."""
-RUNGS = {
+VARIANTS = {
     "tipl-published": "TIPL's design",
     "tipl-decayed": "+ learning rate falls, average of the weights",
     "tipl-residual": "+ predicts the step, not the position",
@@ -52,7 +52,7 @@ RUNGS = {
     "gate-own": "one small network for all parameters (tipl-gate)",
     "tipl-gate": "+ trained on all seven tasks",
 }
-"""The ladder: each line changes one thing."""
+"""The ablation: each line changes one thing."""
 
 
 class Board:
@@ -93,7 +93,7 @@ def read() -> list[TaskRow]:
     return [row for file in sorted(ROWS.glob("*.csv")) for row in read_rows(file)]
 
 
-def ladder_tasks(board: Board) -> list[str]:
-    """Return the tasks of the ladder on which its first rung was evaluated."""
-    first = next(iter(RUNGS))
-    return [task for task in LADDER_TASKS if board.score(task, first, "skill", 1)]
+def ablation_tasks(board: Board) -> list[str]:
+    """Return the tasks of the ablation on which its first variant was evaluated."""
+    first = next(iter(VARIANTS))
+    return [task for task in ABLATION_TASKS if board.score(task, first, "skill", 1)]

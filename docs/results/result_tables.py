@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from board import PAPER, PAPER_SPLITS, RIVAL, RUNGS, SIMPLE, TASKS, Board, ladder_tasks
+from board import PAPER, PAPER_SPLITS, RIVAL, SIMPLE, TASKS, VARIANTS, Board, ablation_tasks
 
 from tipl.evaluation.results import Interval
 
@@ -59,16 +59,16 @@ def transfer_table(board: Board) -> str:
     return "\n".join(lines)
 
 
-def ladder_table(board: Board) -> str:
-    """Return the skill of each rung on the tasks of the ladder."""
-    tasks = ladder_tasks(board)
+def ablation_table(board: Board) -> str:
+    """Return the skill of each variant on the tasks of the ablation."""
+    tasks = ablation_tasks(board)
     heads = [f"{TASKS[task]}, h = {h}" for task in tasks for h in (1, 10)]
     lines = [
         "| model | trainings | " + " | ".join(heads) + " |",
         "|---|---:" + "|---:" * len(heads),
     ]
     lines[1] += "|"
-    for name, told in RUNGS.items():
+    for name, told in VARIANTS.items():
         scores = [board.score(task, name, "skill", h) for task in tasks for h in (1, 10)]
         if not any(scores):
             continue

@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ladder(small_dataset: Path) -> list[Forecaster]:
+def every_baseline(small_dataset: Path) -> list[Forecaster]:
     runs = wt.open(small_dataset).split("train").runs
     return fit_baselines(runs, horizons=(1, 2, 5), training=BRIEFLY)
 
@@ -291,10 +291,10 @@ def test_validation_runs_choose_the_state(template: wt.Run, folder: Path, unseen
     assert skills(chosen, [noise], [1, 5])[1] > skills(plain, [noise], [1, 5])[1]
 
 
-# Everything on the ladder
+# All of them
 
 
-def test_names_are_stable(ladder: list[Forecaster]) -> None:
+def test_names_are_stable(every_baseline: list[Forecaster]) -> None:
     without = (
         ["persistence", "last-step"]
         + [f"trend-{window}" for window in (5, 20, 50, 200)]
@@ -307,18 +307,20 @@ def test_names_are_stable(ladder: list[Forecaster]) -> None:
         + ["ar-20", "ar-20-phase", "ar-20-svd", "cmd", "lfd-2", "wnn", "nino-mlp"]
     )
     assert list(unfitted()) == without
-    assert [forecaster.name for forecaster in ladder] == without + fitted
-    assert all(forecaster.causal for forecaster in ladder)
+    assert [forecaster.name for forecaster in every_baseline] == without + fitted
+    assert all(forecaster.causal for forecaster in every_baseline)
     assert load("ema-0.95") == Extrapolation(Ema(0.95))
     with pytest.raises(ForecastError, match=r"persistence, last-step(.|\n)*got: ar-20"):
         load("ar-20")
 
 
-def test_all_are_saved_and_loaded(ladder: list[Forecaster], unseen: wt.Run, tmp_path: Path) -> None:
-    ladder = [*ladder, Reconstruction(7)]
-    save_baselines(ladder, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {made.name for made in ladder}
-    for made in ladder:
+def test_all_are_saved_and_loaded(
+    every_baseline: list[Forecaster], unseen: wt.Run, tmp_path: Path
+) -> None:
+    every_baseline = [*every_baseline, Reconstruction(7)]
+    save_baselines(every_baseline, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {made.name for made in every_baseline}
+    for made in every_baseline:
         again = load(tmp_path / made.name)
         assert type(again) is type(made)
         assert (again.name, again.causal) == (made.name, made.causal)
@@ -328,8 +330,10 @@ def test_all_are_saved_and_loaded(ladder: list[Forecaster], unseen: wt.Run, tmp_
         assert files in ({"config.json"}, {"config.json", "model.safetensors"})
 
 
-def test_forecasts_have_the_form_of_the_request(ladder: list[Forecaster], unseen: wt.Run) -> None:
-    for made in ladder:
+def test_forecasts_have_the_form_of_the_request(
+    every_baseline: list[Forecaster], unseen: wt.Run
+) -> None:
+    for made in every_baseline:
         found = made.forecast(unseen, [40, 0, 7, 7], [5, 1])
         assert found.dtype == np.float32
         assert found.shape == (4, 2, P)
@@ -339,8 +343,8 @@ def test_forecasts_have_the_form_of_the_request(ladder: list[Forecaster], unseen
         np.testing.assert_allclose(found[3], found[2], atol=1e-7)
 
 
-def test_requests_that_cannot_be_met(ladder: list[Forecaster], unseen: wt.Run) -> None:
-    for made in ladder:
+def test_requests_that_cannot_be_met(every_baseline: list[Forecaster], unseen: wt.Run) -> None:
+    for made in every_baseline:
         for starts, horizons in (([-1], [1]), ([49], [1]), ([3], [0]), ([], [1])):
             with pytest.raises(ForecastError, match="starts from 0 to 48, horizons from 1"):
                 made.forecast(unseen, starts, horizons)
@@ -373,27 +377,30 @@ def test_short_runs_are_refused(template: wt.Run, folder: Path) -> None:
 
 
 def test_a_damaged_run_is_refused_and_a_decoded_one_is_not_read_again(
-    ladder: list[Forecaster], template: wt.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    every_baseline: list[Forecaster],
+    template: wt.Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(0)
     weights = 1e-3 * rng.normal(size=(300, P)).cumsum(0)
     run = run_like(template, weights, tmp_path)
-    before = [made.forecast(run, [100, 127], [1, 5]) for made in ladder]
+    before = [made.forecast(run, [100, 127], [1, 5]) for made in every_baseline]
     for chunk in run.path.glob("policy/weights/c/2*"):  # rows 256 and later
         for file in [chunk] if chunk.is_file() else chunk.iterdir():
             file.write_bytes(b"damaged")
     damaged = wt.open_run(run.path)
-    for made, expected in zip(ladder, before, strict=True):
+    for made, expected in zip(every_baseline, before, strict=True):
         assert np.array_equal(made.forecast(damaged, [100, 127], [1, 5]), expected), made.name
     monkeypatch.setenv("WEIGHTTRAJ_CACHE", str(tmp_path / "cache"))
     again = wt.open_run(run.path)
-    for made in ladder:
+    for made in every_baseline:
         with pytest.raises(DamageError):
             made.forecast(again, [100], [1])
 
 
 def test_a_fit_serves_policies_of_other_sizes(
-    ladder: list[Forecaster], unseen: wt.Run, tmp_path: Path
+    every_baseline: list[Forecaster], unseen: wt.Run, tmp_path: Path
 ) -> None:
     tensors = {
         "w": ((40, 20), "weight", ("hidden_0", "observation")),
@@ -406,11 +413,11 @@ def test_a_fit_serves_policies_of_other_sizes(
             row = rng.normal(size=840).astype(np.float32)
             writer.append(row, num_timesteps=t, phase=(t - 1) % 4 if t else -1)
     large = wt.open_run(tmp_path / "large.zarr")
-    for made in ladder:
+    for made in every_baseline:
         assert made.forecast(large, [0, 20], [1]).shape == (2, 1, 840), made.name
 
 
-def test_the_ladder_says_what_it_does(small_dataset: Path, ladder: list[Forecaster]) -> None:
+def test_the_fit_says_what_it_does(small_dataset: Path, every_baseline: list[Forecaster]) -> None:
     dataset, said = wt.open(small_dataset), []
     again = fit_baselines(
         dataset.split("train").runs,
@@ -421,7 +428,7 @@ def test_the_ladder_says_what_it_does(small_dataset: Path, ladder: list[Forecast
     )
     assert said[:3] == ["read seed0000", "read seed0001", "read seed0002, for validation"]
     assert said[-1] == "fitted nino-mlp"
-    for one, other in zip(ladder, again, strict=True):
+    for one, other in zip(every_baseline, again, strict=True):
         if isinstance(one, Regression):  # validation runs are for the networks only
             assert np.array_equal(one.coefficients, other.coefficients)
 
@@ -440,9 +447,9 @@ def test_the_ladder_says_what_it_does(small_dataset: Path, ladder: list[Forecast
     ],
 )
 def test_settings_that_do_not_fit(
-    change: dict, message: str, ladder: list[Forecaster], tmp_path: Path
+    change: dict, message: str, every_baseline: list[Forecaster], tmp_path: Path
 ) -> None:
-    (made,) = [made for made in ladder if made.name == "ar-20"]
+    (made,) = [made for made in every_baseline if made.name == "ar-20"]
     made.save(tmp_path)
     config = json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "config.json").write_text(json.dumps(config | change))
@@ -450,8 +457,8 @@ def test_settings_that_do_not_fit(
         Regression.load(tmp_path)
 
 
-def test_arrays_that_do_not_fit(ladder: list[Forecaster], tmp_path: Path) -> None:
-    by = {made.name: made for made in ladder}
+def test_arrays_that_do_not_fit(every_baseline: list[Forecaster], tmp_path: Path) -> None:
+    by = {made.name: made for made in every_baseline}
     for name in ("ar-20", "wnn"):
         by[name].save(tmp_path)
         file = tmp_path / "model.safetensors"

@@ -104,7 +104,7 @@ def test_it_is_fitted_to_walks_with_its_amplitudes(short: wt.Run, tmp_path: Path
     assert again.amplitudes == {1: 4.0, 5: 1.5}
 
 
-# Its rivals
+# Along other forecasters
 
 
 def test_any_other_forecast_is_followed_too(run: wt.Run, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Rivals of a forecast that know the last iterations only."""
+"""Outer steps: what to compare a forecast with, from the displacements of the last iterations."""
 
 from __future__ import annotations
 

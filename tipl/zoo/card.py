@@ -219,12 +219,12 @@ def _fits(metrics: Metrics) -> Iterator[str]:
     data = metrics.results.data
     # Every folder of fitted baselines has both of these.
     fitted = [f for f in read if f.name in (PERSISTENCE, "ar-20-phase") and str(f) != f.name]
-    ladders = list(dict.fromkeys(folder.parent for folder in fitted))
-    yield from (f"tipl train baselines --data {data} --out {ladder}" for ladder in ladders)
+    folders = list(dict.fromkeys(folder.parent for folder in fitted))
+    yield from (f"tipl train baselines --data {data} --out {made}" for made in folders)
     for folder in read:
         along = folder.name.rpartition("-")[0]
-        if folder.name.endswith(STRETCHED) and ladders:
-            yield f"tipl train stretched --along {ladders[0] / along} --data {data} --out {folder}"
+        if folder.name.endswith(STRETCHED) and folders:
+            yield f"tipl train stretched --along {folders[0] / along} --data {data} --out {folder}"
 
 
 def _option(setting: tuple[str, Any]) -> str:

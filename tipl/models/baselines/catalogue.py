@@ -10,7 +10,7 @@ import msgspec
 
 from tipl.models.baselines.features import Ema, EndPoints, Features, Slope, Steps
 from tipl.models.baselines.modes import ModeSteps
-from tipl.models.baselines.rivals import LastIteration, LeadingDirections, Lines, Relex
+from tipl.models.baselines.published import LastIteration, LeadingDirections, Lines, Relex
 from tipl.models.baselines.subspace import ProjectedSteps
 from tipl.saved import broken
 

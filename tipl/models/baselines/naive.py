@@ -14,7 +14,7 @@ from tipl.forecaster import Forecaster, check_request
 from tipl.models.baselines.catalogue import features_of
 from tipl.models.baselines.data import Trajectory
 from tipl.models.baselines.features import Ema, Features, Slope, Steps
-from tipl.models.baselines.rivals import LastIteration, LeadingDirections, Lines, Relex
+from tipl.models.baselines.published import LastIteration, LeadingDirections, Lines, Relex
 from tipl.models.baselines.subspace import DMD
 from tipl.runs import weights_of
 from tipl.saved import SavedSettings, broken, read_config, write

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from tipl.errors import ForecastError
 from tipl.forecaster import check_request
 from tipl.models.baselines.data import Trajectory
-from tipl.models.baselines.rivals import leading
+from tipl.models.baselines.published import leading
 from tipl.representation import embed
 from tipl.saved import SavedSettings
 from weighttraj import Run

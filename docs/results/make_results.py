@@ -1,11 +1,11 @@
 """Every way to forecast policy weights, on seven tasks: trains, evaluates, writes docs/results.md.
 
-python docs/results/arbiter.py --plan      # the commands, and what they cost
-python docs/results/arbiter.py --run       # run them; stopped, the same command goes on
-python docs/results/arbiter.py             # write the page from the rows in docs/results/rows
+python docs/results/make_results.py --plan      # the commands, and what they cost
+python docs/results/make_results.py --run       # run them; stopped, the same command goes on
+python docs/results/make_results.py             # write the page from the rows in docs/results/rows
 
 Each command is one of `tipl`, so any of them can be run alone. Models and measurements go to
-data/arbiter; the rows of all evaluations, which are all that the page is made of, to
+data/results; the rows of all evaluations, which are all that the page is made of, to
 docs/results/rows. A CSV file that somebody adds there joins the tables.
 """
 
@@ -26,24 +26,24 @@ from pathlib import Path
 
 from answers import answers, findings
 from board import (
+    ABLATION_BATCHES,
+    ABLATION_SEEDS,
+    ABLATION_TASKS,
     HERE,
-    LADDER_BATCHES,
-    LADDER_SEEDS,
-    LADDER_TASKS,
     PAPER,
     PAPER_SPLITS,
     RIVAL,
     ROWS,
-    RUNGS,
     SEEDS,
     SIMPLE,
     TASKS,
+    VARIANTS,
     Board,
     read,
 )
 from result_figures import figures
 from result_tables import (
-    ladder_table,
+    ablation_table,
     paper_table,
     returns_table,
     transfer_table,
@@ -61,7 +61,7 @@ from weighttraj.text import between
 ROOT = HERE.parents[1]
 PAGE, README = HERE.parent / "results.md", ROOT / "README.md"
 COST = HERE / "cost.json"
-OUT = Path("data/arbiter")
+OUT = Path("data/results")
 
 STRETCHED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase")
 """Forecasts that are stretched by what the returns of validation runs say, all with one grid."""
@@ -95,17 +95,17 @@ def plan() -> list[Step]:
         Step(
             name="baselines",
             commands=tuple(
-                f"tipl train baselines --data {task} --out {OUT}/{task}/ladder" for task in TASKS
+                f"tipl train baselines --data {task} --out {OUT}/{task}/baselines" for task in TASKS
             ),
         ),
         Step(name="gates", commands=tuple(gates)),
-        Step(name="from TIPL to tipl-gate", commands=tuple(_ladder())),
+        Step(name="from TIPL to tipl-gate", commands=tuple(_ablation())),
         Step(name="stretched forecasts", commands=tuple(_stretched())),
         Step(
             name="evaluation",
             commands=(
                 _evaluation("weights", _in_weights()),
-                _evaluation("ladder", _on_ladder(), LADDER_TASKS),
+                _evaluation("ablation", _on_ablation(), ABLATION_TASKS),
                 _evaluation("returns", _in_returns()),
             ),
         ),
@@ -121,12 +121,12 @@ def plan() -> list[Step]:
     ]
 
 
-def _ladder() -> Iterator[str]:
-    batches = f"--n-batches {LADDER_BATCHES}"
+def _ablation() -> Iterator[str]:
+    batches = f"--n-batches {ABLATION_BATCHES}"
     tipl = f"{batches} --warmup 100 --save-every 250"
     better = f"{tipl} --schedule cosine --ema 0.99"
-    for seed in LADDER_SEEDS:
-        for task in LADDER_TASKS:
+    for seed in ABLATION_SEEDS:
+        for task in ABLATION_TASKS:
             for name, kind, options in (
                 ("tipl-published", "tipl", tipl),
                 ("tipl-decayed", "tipl", better),
@@ -142,7 +142,10 @@ def _ladder() -> Iterator[str]:
 def _stretched() -> Iterator[str]:
     for name in STRETCHED:
         for task in TASKS:
-            along = {"tipl-gate": f"{OUT}/all/tipl-gate@0", RIVAL: f"{OUT}/{task}/ladder/{RIVAL}"}
+            along = {
+                "tipl-gate": f"{OUT}/all/tipl-gate@0",
+                RIVAL: f"{OUT}/{task}/baselines/{RIVAL}",
+            }
             yield (
                 f"tipl train stretched --along {along.get(name, name)} --data {task} "
                 f"--out {OUT}/{task}/{name}-stretched --horizons 50 100 --amplitudes {AMPLITUDES} "
@@ -157,7 +160,7 @@ def _in_weights() -> list[str]:
     return [
         *simple,
         *rivals,
-        *(f"{OUT}/{{data}}/ladder/{name}" for name in fitted),
+        *(f"{OUT}/{{data}}/baselines/{name}" for name in fitted),
         *(f"{OUT}/all/tipl-gate@{seed}" for seed in SEEDS),
         f"{OUT}/all/gate-timed@0",
         f"{OUT}/{{data}}/gate-elsewhere@0",
@@ -170,13 +173,13 @@ def _in_returns() -> list[str]:
         *(f"{OUT}/{{data}}/{name}-stretched" for name in STRETCHED),
         f"{OUT}/all/tipl-gate@0",
         f"{OUT}/{{data}}/gate-elsewhere@0",
-        f"{OUT}/{{data}}/ladder/{RIVAL}",
+        f"{OUT}/{{data}}/baselines/{RIVAL}",
     ]
 
 
-def _on_ladder() -> list[str]:
-    names = [name for name in RUNGS if name != "tipl-gate"]
-    return [f"{OUT}/{{data}}/{name}@{seed}" for name in names for seed in LADDER_SEEDS]
+def _on_ablation() -> list[str]:
+    names = [name for name in VARIANTS if name != "tipl-gate"]
+    return [f"{OUT}/{{data}}/{name}@{seed}" for name in names for seed in ABLATION_SEEDS]
 
 
 def _evaluation(name: str, forecasters: Sequence[str], tasks: Sequence[str] = tuple(TASKS)) -> str:
@@ -266,7 +269,7 @@ def page(rows: Sequence[TaskRow]) -> dict[str, str]:
         "returns": returns_table(returns),
         "transfer": transfer_table(weights),
         **({"paper": paper_table()} if PAPER.exists() else {}),
-        "ladder": ladder_table(weights),
+        "ablation": ablation_table(weights),
         "commands": "\n".join(["```text", *cost_lines(plan()), "```"]),
     }
 
@@ -304,7 +307,7 @@ def insert(text: str) -> str:
         if f"<!-- {name}: " not in text:
             continue
         text = between(
-            text, f"<!-- {name}: written by arbiter.py -->", f"<!-- end of {name} -->", content
+            text, f"<!-- {name}: written by make_results.py -->", f"<!-- end of {name} -->", content
         )
     return text
 

@@ -13,8 +13,7 @@ from tipl.errors import ForecastError
 from tipl.models.baselines.data import Trajectory
 from tipl.models.baselines.features import Features
 from tipl.models.baselines.naive import Extrapolation
-from tipl.models.baselines.reconstruction import PathOracle
-from tipl.models.baselines.rivals import (
+from tipl.models.baselines.published import (
     LastIteration,
     LeadingDirections,
     Lines,
@@ -22,6 +21,7 @@ from tipl.models.baselines.rivals import (
     iteration_length,
     leading,
 )
+from tipl.models.baselines.reconstruction import PathOracle
 from tipl.registry import load
 
 P = 122
