@@ -33,8 +33,11 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	$(BIN)/tipl report datasets/demo/results.json --into docs/quickstart.md
 	$(BIN)/python docs/results/make_results.py
 	$(BIN)/tipl report docs/studies/live/test/results.json --into README.md
-	$(BIN)/tipl report docs/studies/live/test/results.json --into docs/live.md
-	$(BIN)/tipl report docs/studies/live/tuning/results.json --into docs/live.md
+	for stage in live/test live/tuning confirm/test confirm/tuning; do \
+		for page in docs/live.md docs/studies/live-tables.md; do \
+			$(BIN)/tipl report docs/studies/$$stage/results.json --into $$page || exit 1; \
+		done; \
+	done
 	$(BIN)/tipl zoo --into README.md
 	$(BIN)/python datasets/pages.py
 	$(BIN)/python examples/plot_path_and_returns.py docs/path-and-returns.png

@@ -111,4 +111,4 @@ except ImportError as error:
 def test_a_missing_extra_names_the_command(missing: str, use: str, extra: str) -> None:
     said = run(BLOCKED.format(missing=missing, use=use))
     assert missing in said
-    assert f"pip install 'weighttraj[{extra}]'" in said
+    assert f"pip install -e '.[{extra}]'" in said

@@ -58,8 +58,8 @@ def _collect(
 
     Args:
         recipe: Recipe, a TOML file such as datasets/demo/recipe.toml.
-        out: Folder of the data set. Default: data/<id of the recipe>.
-        seeds: Only these seeds: 3, a range 0:50 (the end excluded), or several: 0:4,30:32. Default:
+        out: Folder of the data set; unset: data/<id of the recipe>.
+        seeds: Only these seeds: 3, a range 0:50 (the end excluded), or several: 0:4,30:32; unset:
             all seeds of the recipe.
         workers: Number of processes; each trains one run, or one population, at a time.
     """
@@ -308,7 +308,7 @@ def _download(
 
     Args:
         address: hf://organisation/name, s3://bucket/prefix, gs://, az://, https://, file://.
-        out: New folder. Default: a folder in which `wt.open` finds it by its id.
+        out: New folder; unset: a folder in which `wt.open` finds it by its id.
         runs: Download only these runs, by id.
         steps: Download only snapshots from one environment step to another.
         arrays: Download only these groups beside the weights: critic, optimizer, probe, train,
@@ -388,7 +388,7 @@ def _verify(
         path: Data set (path or id) or run.
         deep: Decode every array, also if the manifest has the checksum of its file.
         replay: Number of snapshots of a run to train again and compare; 0: none.
-        seed: Seed of the run that is trained again. Default: the first run.
+        seed: Seed of the run that is trained again; unset: the first run.
     """
     import_modules(imports)
     place = locate(path)
@@ -435,7 +435,7 @@ def _pack(
     Args:
         path: Finished run.
         profile: `default` is for every Zarr v3 reader; `archive` is smaller and needs PCodec.
-        out: New file. Default: the path of the run with .zip.
+        out: New file; unset: the path of the run with .zip.
     """
     say(wt.pack(path, profile=profile, out=out))
 
@@ -456,8 +456,8 @@ def _report(
     Args:
         path: Data set (path or id) or run.
         all: Write a gallery: a page for each local data set and each model card, and an index.
-        cards: Folder of the model cards, with --all. Default: cards/models of the clone.
-        out: New page, or folder with --all; replaces an earlier report. Default: report.html or
+        cards: Folder of the model cards, with --all; unset: cards/models of the clone.
+        out: New page, or folder with --all; replaces an earlier report; unset: report.html or
             gallery.
         film: Add a short film of a policy at five moments of its training.
         seed: Seed of the episodes in the film.
@@ -500,7 +500,7 @@ def _export(
         to: hdf5: one file with everything; npy: weights.npy and tables; safetensors: one snapshot;
             sb3: one snapshot as a model that PPO.load reads, and its VecNormalize.
         out: File (hdf5, safetensors) or folder (npy, sb3) to be written.
-        t: Index of the snapshot. Default: the last.
+        t: Index of the snapshot; unset: the last.
     """
     if to == "hdf5":
         say(wt.export_hdf5(locate(path), out))

@@ -162,7 +162,7 @@ def make(env_id: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
             got=f"{env_id!r}: {error}",
             do="print the ids with gymnasium.pprint_registry(), or import the module that "
             "registers yours (--import MODULE on the command line); MuJoCo's come with "
-            "pip install 'weighttraj[sb3]'",
+            "pip install -e '.[sb3]' in the clone",
         ) from error
 
 

@@ -136,5 +136,5 @@ def needs(extra: str) -> Iterator[None]:
         raise MissingExtraError(
             f"this part of the package needs {error.name}, which is not installed",
             where=f"optional dependencies [{extra}]",
-            do=f"pip install 'weighttraj[{extra}]'",
+            do=f"in the clone: pip install -e '.[{extra}]'",
         ) from error

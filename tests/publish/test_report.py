@@ -239,7 +239,7 @@ report({str(path)!r}, {str(tmp_path / "report.html")!r})
 """
     subprocess.run([sys.executable, "-c", code], check=True)
     parsed = Page((tmp_path / "report.html").read_text())
-    assert "pip install 'weighttraj[sb3]'" in parsed.text
+    assert "pip install -e '.[sb3]'" in parsed.text
     assert len([a for _, a in parsed.tags if a.get("role") == "img"]) == 4
 
 

@@ -197,7 +197,7 @@ def test_code_in_a_repository_is_left_there(hub: stand_in.Hub, tmp_path: Path) -
 
 def test_without_the_client(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "huggingface_hub", None)
-    with pytest.raises(ImportError, match=r"pip install 'weighttraj\[hub\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '.\[hub\]'"):
         wt.open("hf://us/small")
 
 
@@ -205,5 +205,5 @@ def test_without_obstore(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
     store_at.cache_clear()
     for module in ("obstore", "obstore.store"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
-    with pytest.raises(ImportError, match=r"pip install 'weighttraj\[remote\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '.\[remote\]'"):
         wt.open(f"file://{tmp_path}")

@@ -411,10 +411,10 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
         file: time for file, time in files.items() if file != lost
     }
     page = plan.parent / "page.md"
-    places = ("out/test/results.json, summary", "out/test/results.json")
+    places = [f"out/test/results.json{section}" for section in (", summary", "", ", tables")]
     page.write_text("".join(f"<!-- live of {x} -->\n<!-- end of live -->\n" for x in places))
     run_command("tipl report out/test/results.json --into page.md")
-    assert page.read_text().count("\n| ") == 2 + 2 + 4
+    assert page.read_text().count("\n| ") == 2 + 3 + 2 * 3  # summary, overview, tables
     assert page.read_text().count("It is the forecast that was best on the tuning seeds.") == 1
     assert "| pendulum, 3 test seeds | far | " in page.read_text()
     assert "| outer (amplitude " in page.read_text()

@@ -41,16 +41,18 @@ WIDE = 150
 class EvaluateCommand(EvaluateConfig):
     """Evaluate forecasters on held-out runs beside persistence, and write a report.
 
-    Several data sets are evaluated one after another, each in a folder of its id below ``--out``;
-    ``tipl leaderboard`` compares forecasters over all of them.
+    Several data sets are evaluated one after another, each in a folder of its id below ``--out``.
+    The command ``tipl leaderboard`` compares forecasters over all of them.
+
+    Example: tipl evaluate tipl-gate --data hopper-v4-ppo-16x16-v1 --out data/report --quick
     """
 
     forecasters: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[FORECASTER ...]")
     ] = ()
-    """Folders of models and of fitted baselines; names of released models, or of baselines that
-    need no fit, such as ``ema-0.95``; or classes, ``module:Class``. ``{data}`` in a name stands for
-    the id of the data set: ``data/results/{data}/gate``."""
+    """Names of released models (``tipl zoo``) or of baselines that need no fit (``ema-0.95``).
+    Folders of trained models or of fitted baselines. Classes, as ``module:Class``.
+    In a name ``{data}`` stands for the id of the data set: ``data/results/{data}/gate``."""
     data: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA ...")]  # type: ignore[assignment]
     """Data sets: paths or ids."""
     quick: bool = False

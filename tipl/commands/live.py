@@ -23,6 +23,8 @@ class LiveCommand(LiveConfig):
     """Run one stage of a study: its arms on its tasks with its seeds, and compare them.
 
     Each population of seeds is a file; with the same command a study goes on where it stopped.
+
+    Example: tipl live plan.toml --out data/study --stage tuning
     """
 
     plan: tyro.conf.Positional[Path]

@@ -35,19 +35,19 @@ class LiveConfig:
     out: Path
     """Folder of results; each stage has a folder of its own in it."""
     stage: Stage = "test"
-    """``tuning``: all points of the grids on the tuning seeds; ``test``: of each arm the best point
-    on the test seeds."""
+    """``tuning``, which runs first: all points of the grids on the tuning seeds.
+    ``test``: the best point of each arm on the test seeds."""
     tasks: tuple[str, ...] = ()
     """Tasks to train on; empty: all of the plan."""
     arms: tuple[str, ...] = ()
-    """Arms to train; empty: all of the plan. The baseline always runs. Results also hold the arms
-    that were trained earlier."""
+    """Arms to train; empty: all of the plan. The baseline always runs.
+    Results also hold the arms that were trained earlier."""
     seeds: int | None = None
     """Number of seeds, the first ones; unset: all of the stage."""
     workers: int = 1
     """Number of processes; each takes a population of seeds at a time."""
     scheduler: str | None = None
-    """Address of a Dask scheduler whose workers do it instead, or ``local``."""
+    """Address of a Dask cluster, tcp://host:port, or `local` for --workers processes here."""
 
 
 def run_live(

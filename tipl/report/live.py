@@ -32,15 +32,17 @@ def insert_live(results: LiveResults, source: Path, page: Path) -> None:
     The figures lie beside the results.
 
     A place begins with ``<!-- live of FILE, TASK -->``, with the task's hyphens as underscores, or
-    ``<!-- live of FILE -->`` for all tasks, or ``<!-- live of FILE, summary -->`` for a table with
-    a line for each, and ends with ``<!-- end of live -->``.
+    ``<!-- live of FILE -->`` for all tasks, ``<!-- live of FILE, summary -->`` for a table with a
+    line for each, or ``<!-- live of FILE, tables -->`` for every figure, and ends with
+    ``<!-- end of live -->``.
     """
     old = page.read_text(encoding="utf-8")
     folder = Path(os.path.relpath(source.parent, page.parent)).as_posix()
     new = rewrite(
         old, _WHAT, source.as_posix(), lambda section: render(results, source, folder, section)
     )
-    if any(place.source == source.as_posix() for place in places(new)):
+    mine = [place.section for place in places(new) if place.source == source.as_posix()]
+    if {*mine} - {"summary", "tables"}:
         write_figures(results, source.parent)
     replace_file(page.resolve(), new.encode())
 
@@ -52,10 +54,18 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         results: of one stage of a study.
         source: their file, for messages.
         folder: the figures' folder, as the page links to it.
-        section: a task with underscores, ``overview`` for all, or ``summary`` for a line each.
+        section: a task with underscores, ``overview`` for all, ``summary`` for a line each, or
+            ``tables`` for every figure.
     """
     if section == "summary":
         return summary(results)
+    if section == "tables":
+        return "\n\n".join(
+            _markdown(results, task, against)
+            for task in results.thresholds
+            for against in _others(results)
+            if rows_of(results, task, against)
+        )
     wanted = [
         task
         for task in results.thresholds
@@ -64,7 +74,7 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
     if not wanted:
         raise EvaluateError(
             "the results have no such task",
-            expected="overview, for all, summary, or one of " + ", ".join(results.thresholds),
+            expected="overview, summary, tables, or one of " + ", ".join(results.thresholds),
             got=section,
             where=source,
             do="correct the marker in the page",
@@ -74,9 +84,8 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         parts.append(verdict(results, task))
         parts.append(f"![Learning curves of {task}]({folder}/{task}.svg)")
         parts.append(f"![Ratios of environment steps, {task}]({folder}/{task}-ratios.svg)")
-        for against in dict.fromkeys((results.baseline, results.rival)):
-            if rows_of(results, task, against):
-                parts.append(_markdown(results, task, against))
+        if rows_of(results, task, results.baseline):
+            parts.append(_short(results, task))
     if section == "overview" and (told := not_run(results)):
         parts.append(told)
     return "\n\n".join(parts)
@@ -145,9 +154,9 @@ def write_figures(results: LiveResults, folder: Path) -> None:
 
 def summary(results: LiveResults, threshold: str = "90") -> str:
     """Return a table of the arms that were best on the tuning seeds, a task a line."""
-    others = [arm for arm in dict.fromkeys((results.baseline, results.rival)) if arm]
+    others = _others(results)
     lines = [
-        f"| task | best forecast of the tuning | steps to {threshold} %, against "
+        f"| task | forecast, best on tuning seeds | steps to {threshold} %, against "
         f"{' | against '.join(map(escaped, others))} |",
         f"|---|---|{'---:|' * len(others)}",
     ]
@@ -220,7 +229,7 @@ def curves_figure(results: LiveResults, task: str, only: Sequence[str] = ()) -> 
 
 def ratios_figure(results: LiveResults, task: str) -> Drawing:
     """Return the ratios of environment steps to each threshold, against both other arms."""
-    rivals = [a for a in dict.fromkeys((results.baseline, results.rival)) if a]
+    rivals = _others(results)
     shares = list(results.thresholds[task])
     arms = rows_of(results, task, results.baseline)
     fig = Drawing(figsize=(9, 1 + 0.45 * len(arms)), layout="constrained")
@@ -262,6 +271,29 @@ def _draw(axes: Any, series: Series, name: str, colour: str, line: str) -> None:
     if len(returns) > 1:
         band = {"color": colour, "alpha": 0.12, "linewidth": 0}
         axes.fill_between(series.num_timesteps, low, high, **band)
+
+
+def _others(results: LiveResults) -> list[str]:
+    """Return the arms that all others are compared with."""
+    return [arm for arm in dict.fromkeys((results.baseline, results.rival)) if arm]
+
+
+def _short(results: LiveResults, task: str, threshold: str = "90") -> str:
+    """Return a table of the most important figures: an arm a line."""
+    others, name = _others(results), f"steps to {threshold} %"
+    found = {(f.arm, f.against, f.name): f for f in results.figures if f.task == task}
+    lines = [
+        f"| {escaped(task)} | {name}, against {' | against '.join(map(escaped, others))} | final | "
+        "worst decile | forecasts |",
+        f"|---|{'---:|' * (len(others) + 3)}",
+    ]
+    for arm in rows_of(results, task, results.baseline):
+        wanted = [(arm, other, name) for other in others]
+        wanted += [(arm, results.baseline, column) for column in ("final", "worst decile")]
+        texts = [_text(found.get(key), interval=True) for key in wanted]
+        cost = cells(results, task, arm, results.baseline)[-1]
+        lines.append(f"| {escaped(arm_label(results, task, arm))} | {' | '.join(texts)} | {cost} |")
+    return "\n".join(lines)
 
 
 def _markdown(results: LiveResults, task: str, against: str) -> str:
