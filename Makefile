@@ -34,7 +34,7 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	$(BIN)/python docs/results/make_results.py
 	$(BIN)/tipl report docs/studies/live/test/results.json --into README.md
 	for stage in live/test live/tuning confirm/test confirm/tuning; do \
-		for page in docs/live.md docs/studies/live-tables.md; do \
+		for page in docs/live.md docs/live-tables.md; do \
 			$(BIN)/tipl report docs/studies/$$stage/results.json --into $$page || exit 1; \
 		done; \
 	done

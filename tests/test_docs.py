@@ -179,7 +179,7 @@ def test_live(reader: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("page", ["docs/live.md", "docs/studies/live-tables.md", "README.md"])
+@pytest.mark.parametrize("page", ["docs/live.md", "docs/live-tables.md", "README.md"])
 def test_the_study_of_trainings_says_what_was_measured(
     page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
