@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from tipl.live.results import Cpu, Curve, Series, read_live
 from tipl.live.study import LiveConfig, run_live
 from tipl.live.summary import compare, mean_log_ratio, steps_to, thresholds_of
 from tipl.registry import unfitted
+from weighttraj.atomic import lock_of
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.collect.agents import find_agent
 from weighttraj.collect.describe import describe_run
@@ -428,6 +431,23 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     run_command("tipl live plan.toml --out out --stage test --arms outer")
     run_command("tipl report out/test/results.json --into page.md")
     assert "Not run yet: pendulum (far)." in page.read_text()
+
+
+def test_two_commands_share_the_work(plan: Path) -> None:
+    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning")
+    here = config.out / "tuning/pendulum/ppo/10-11.json"
+    here.parent.mkdir(parents=True)
+    with ThreadPoolExecutor(1) as pool:
+        with lock_of(here.with_name(".10-11.json.lock")):  # as another command holds it
+            other = pool.submit(run_live, config)
+            while len([*config.out.rglob("10-11.json")]) < 3:
+                assert not other.done()
+                time.sleep(0.05)
+            assert not here.exists()
+        results = other.result()
+    assert here.exists()
+    assert len(results.series) == 4
+    assert not [*config.out.rglob(".*.lock")]
 
 
 @pytest.mark.long

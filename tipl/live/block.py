@@ -18,7 +18,7 @@ from tipl.live.population import PopulationJumps
 from tipl.live.results import Cpu, Curve
 from tipl.threads import threads
 from weighttraj import RunInfo
-from weighttraj.atomic import replace_file
+from weighttraj.atomic import acquired, lock_of, replace_file
 from weighttraj.collect.agents import find_agent
 from weighttraj.collect.describe import describe_run
 from weighttraj.collect.normalizers import find_normalizers
@@ -42,6 +42,11 @@ class Block(msgspec.Struct, frozen=True, kw_only=True):
     """Gradient steps between the recipe's snapshots."""
     evaluation: Evaluation
     seeds: list[int]
+
+    @property
+    def lock(self) -> Path:
+        """File that the process holds which trains the block."""
+        return self.file.with_name(f".{self.file.name}.lock")
 
     @property
     def source(self) -> dict[str, Any]:
@@ -81,12 +86,31 @@ def make_block(block: Block, tell: Tell) -> None:
     Args:
         block: what is to be done.
         tell: progress callback, called with 1 after each iteration.
+
+    Raises:
+        StoreLockedError: another process is training it.
     """
-    if read_block(block) is None:
-        with threads():
-            made = _Training(block, tell).run()
-        block.file.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(block.file, msgspec.json.encode(made) + b"\n")
+    block.file.parent.mkdir(parents=True, exist_ok=True)
+    lock = acquired(
+        lock_of(block.lock),
+        "another process is training this population",
+        where=block.file,
+        do="wait until it ends",
+    )
+    try:
+        if read_block(block) is None:
+            with threads():
+                made = _Training(block, tell).run()
+            replace_file(block.file, msgspec.json.encode(made) + b"\n")
+        block.lock.unlink(missing_ok=True)  # whoever waits for it finds the file
+    finally:
+        lock.release()
+
+
+def wait_for(block: Block) -> None:
+    """Wait until no other process trains a block."""
+    with lock_of(block.lock):
+        pass
 
 
 class _Training:

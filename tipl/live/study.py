@@ -15,12 +15,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from tipl.errors import EvaluateError
-from tipl.live.block import Block, Made, make_block, read_block
+from tipl.live.block import Block, Made, make_block, read_block, wait_for
 from tipl.live.plan import Plan, Stage, Trial, ppo_of, read_plan, settings_of
 from tipl.live.results import Cpu, Figure, LiveResults, Series, read_live, write_json
 from tipl.live.summary import compare, final, mean_log_ratio, thresholds_of
 from weighttraj.atomic import replace_file
 from weighttraj.engine import engine_of
+from weighttraj.errors import StoreLockedError
 from weighttraj.progress import LoggedProgress
 
 RESULTS = "results.json"
@@ -56,7 +57,8 @@ def run_live(
     """Train what is missing, and write ``results.json`` and ``curves.csv``.
 
     Each population of seeds is a file; those that are there and have the same settings are left
-    alone. So a study that was stopped goes on with the same command. The results hold every arm of
+    alone. So a study that was stopped goes on with the same command, and several commands can share
+    the work: none trains a population that another one is training. The results hold every arm of
     the plan whose trainings are all there, those of earlier commands too.
 
     Raises:
@@ -142,12 +144,20 @@ def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) 
     ):
         total = sum(block.config.n_iterations for block in blocks)
         bar = progress.add_task(f"{len(blocks)} populations", total=total)
-        for block, outcome in engine.run(
-            make_block, blocks, lambda count: progress.advance(bar, count), wait=False
-        ):
-            if isinstance(outcome, Exception):
-                outcome.add_note(f"arm {block.trial.name}, task {block.task}")
-                raise outcome
+        while blocks:
+            elsewhere = []
+            for block, outcome in engine.run(
+                make_block, blocks, lambda count: progress.advance(bar, count), wait=False
+            ):
+                if isinstance(outcome, StoreLockedError):
+                    elsewhere.append(block)
+                elif isinstance(outcome, Exception):
+                    outcome.add_note(f"arm {block.trial.name}, task {block.task}")
+                    raise outcome
+            blocks = elsewhere
+            if blocks:
+                progress.update(bar, description="waiting for another process")
+                wait_for(blocks[0])
 
 
 def _series(plan: Plan, config: LiveConfig) -> list[Series]:
