@@ -40,6 +40,8 @@ def in_threads(
 ) -> list[R]:
     """Do all items, one at a time with each worker; workers have a thread each.
 
+    In each of them torch computes with as many threads as in the calling one.
+
     Args:
         do: called with a worker, an item and an event; it ends soon after the event is set.
         workers: what a thread needs of its own.
@@ -55,8 +57,12 @@ def in_threads(
     """
     waiting, stop = deque(enumerate(items)), Event()
     ended: SimpleQueue[tuple[int, R | BaseException]] = SimpleQueue()
+    count = torch.get_num_threads()
 
     def work(worker: W) -> None:
+        # OpenMP keeps the number for each thread, and MKL's products take it before torch sets it: a
+        # new thread would compute with all cores, and wait for them where others use them.
+        torch.set_num_threads(count)
         while waiting and not stop.is_set():
             with suppress(IndexError):  # another thread took the last one
                 number, item = waiting.popleft()
