@@ -60,8 +60,8 @@ def in_threads(
     count = torch.get_num_threads()
 
     def work(worker: W) -> None:
-        # OpenMP keeps the number for each thread, and MKL's products take it before torch sets it: a
-        # new thread would compute with all cores, and wait for them where others use them.
+        # OpenMP keeps the number for each thread, and MKL's products take it before torch has set
+        # it: a new thread would compute with all cores, and wait for them where others use them.
         torch.set_num_threads(count)
         while waiting and not stop.is_set():
             with suppress(IndexError):  # another thread took the last one
