@@ -418,7 +418,7 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     page.write_text("".join(f"<!-- live of {x} -->\n<!-- end of live -->\n" for x in places))
     run_command("tipl report out/test/results.json --into page.md")
     assert page.read_text().count("\n| ") == 2 + 3 + 2 * 3  # summary, overview, tables
-    assert page.read_text().count("It is the forecast that was best on the tuning seeds.") == 1
+    assert page.read_text().count("of the final return of ppo, far needs ") == 1
     assert "| pendulum, 3 test seeds | far | " in page.read_text()
     assert "| outer (amplitude " in page.read_text()
     for name in ("pendulum.svg", "pendulum-ratios.svg"):
@@ -430,7 +430,7 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     (plan.parent / "out/test/pendulum/far/22-22.json").unlink()
     run_command("tipl live plan.toml --out out --stage test --arms outer")
     run_command("tipl report out/test/results.json --into page.md")
-    assert "Not run yet: pendulum (far)." in page.read_text()
+    assert "Not run yet: pendulum (1 of 3 arms)." in page.read_text()
 
 
 def test_two_commands_share_the_work(plan: Path) -> None:

@@ -96,11 +96,9 @@ def not_run(results: LiveResults) -> str:
     arms, parts = results.plan["arms"], []
     for task in results.plan["tasks"]:
         wanted = [name for name, arm in arms.items() if not arm["tasks"] or task in arm["tasks"]]
-        missing = [escaped(name) for name in wanted if name not in results.best.get(task, {})]
-        if len(missing) == len(wanted):
-            parts.append(f"{escaped(task)} (all arms)")
-        elif missing:
-            parts.append(f"{escaped(task)} ({', '.join(missing)})")
+        missing = [name for name in wanted if name not in results.best.get(task, {})]
+        if missing:
+            parts.append(f"{escaped(task)} ({len(missing)} of {len(wanted)} arms)")
     return f"Not run yet: {'; '.join(parts)}." if parts else ""
 
 
@@ -156,7 +154,7 @@ def summary(results: LiveResults, threshold: str = "90") -> str:
     """Return a table of the arms that were best on the tuning seeds, a task a line."""
     others = _others(results)
     lines = [
-        f"| task | forecast, best on tuning seeds | steps to {threshold} %, against "
+        f"| task | tuned forecast | steps to {threshold} %, against "
         f"{' | against '.join(map(escaped, others))} |",
         f"|---|---|{'---:|' * len(others)}",
     ]
@@ -192,8 +190,7 @@ def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
     needs = " and ".join(text.format(word) for text, word in zip(told, what, strict=True))
     return (
         f"{begun} to {threshold} % of the final return of {escaped(results.baseline)}, "
-        f"{escaped(arm_label(results, task, arm))} needs {needs}. It is the forecast that was best "
-        "on the tuning seeds."
+        f"{escaped(arm_label(results, task, arm))} needs {needs}."
     )
 
 
