@@ -450,6 +450,16 @@ def test_two_commands_share_the_work(plan: Path) -> None:
     assert not [*config.out.rglob(".*.lock")]
 
 
+def test_a_task_that_cannot_be_read_costs_the_others_nothing(plan: Path) -> None:
+    gone = '\ntasks.gone = { recipe = "gone.toml" }\n[arms.ppo]'
+    plan.write_text(PLAN.replace("\n[arms.ppo]", gone))
+    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning")
+    results = run_live(replace(config, tasks=("pendulum",), arms=("far",)))
+    assert [one.arm for one in results.series] == ["ppo", "far"]
+    with pytest.raises(FileNotFoundError, match="gone"):
+        run_live(config)
+
+
 @pytest.mark.long
 def test_processes_make_the_same_curves(plan: Path) -> None:
     stage = {"plan": plan, "stage": "tuning"}

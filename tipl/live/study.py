@@ -21,7 +21,7 @@ from tipl.live.results import Cpu, Figure, LiveResults, Series, read_live, write
 from tipl.live.summary import compare, final, mean_log_ratio, thresholds_of
 from weighttraj.atomic import replace_file
 from weighttraj.engine import engine_of
-from weighttraj.errors import StoreLockedError
+from weighttraj.errors import StoreLockedError, WeightTrajError
 from weighttraj.progress import LoggedProgress
 
 RESULTS = "results.json"
@@ -181,7 +181,7 @@ def _finished(plan: Plan, config: LiveConfig, arm: str) -> list[Series]:
     pairs: dict[str, list[tuple[Block, Made]]] = {}
     try:
         blocks = [block for block in _blocks(plan, config) if block.trial.arm == arm]
-    except EvaluateError:  # not tuned
+    except (WeightTrajError, OSError):  # not tuned, or a recipe of another task cannot be read
         return []
     for block in blocks:
         if (made := read_block(block)) is None:
