@@ -34,8 +34,8 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	$(BIN)/python docs/results/make_results.py
 	$(BIN)/tipl report docs/studies/live/test/results.json --into README.md
 	$(BIN)/tipl report docs/studies/live/test/results.json --into docs/live.md
-	$(BIN)/tipl report docs/studies/confirm/test/results.json --into docs/live.md
-	for stage in live/test live/tuning confirm/test confirm/tuning; do \
+	$(BIN)/tipl report docs/studies/guarded/test/results.json --into docs/live.md
+	for stage in live/test live/tuning confirm/test confirm/tuning guarded/test guarded/tuning; do \
 		$(BIN)/tipl report docs/studies/$$stage/results.json --into docs/live-tables.md || exit 1; \
 	done
 	$(BIN)/tipl zoo --into README.md
