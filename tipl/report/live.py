@@ -162,7 +162,8 @@ def summary(results: LiveResults, threshold: str = "90") -> str:
         arm = results.primary.get(task)
         name = escaped(arm_label(results, task, arm)) if arm else "-"
         found = _primary_figures(results, task, threshold)
-        texts = [_text(found.get(against), interval=True) for against in others]
+        # How many trainings never arrive is in the long tables, which explain it.
+        texts = [_text(found.get(against), interval=True).partition(" (")[0] for against in others]
         count = len(chosen(results, task, results.baseline).curves)
         begun = f"{escaped(task)}, {count} {results.stage} seeds"
         lines.append(f"| {begun} | {name} | {' | '.join(texts)} |")
