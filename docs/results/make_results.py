@@ -63,7 +63,7 @@ PAGE, README = HERE.parent / "results.md", ROOT / "README.md"
 COST = HERE / "cost.json"
 OUT = Path("data/results")
 
-STRETCHED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase")
+STRETCHED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase", "relex-50")
 """Forecasts that are stretched by what the returns of validation runs say, all with one grid."""
 AMPLITUDES = "0.125 0.25 0.5 1 2 4"
 PUBLISHED, PAPER_DATA = "tipl-inverted-pendulum-v4", "inverted-pendulum-v4-ppo-v1"

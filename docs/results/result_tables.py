@@ -30,12 +30,12 @@ def weights_table(board: Board) -> str:
 
 
 def returns_table(board: Board) -> str:
-    """Return the ten best forecasters by gain at h = 50."""
+    """Return the ten best forecasters by gain at h = 50, without persistence, whose gain is 0."""
     lines = [
         f"| forecaster | gain, h = 50 | gain, h = 100 | skill, h = 50 | leads {SIMPLE}, h = 50 |",
         "|---|---:|---:|---:|---:|",
     ]
-    for name in board.names("gain", 50)[:10]:
+    for name in [name for name in board.names("gain", 50) if name != "persistence"][:10]:
         gains = [board.entry(name, "gain", h) for h in (50, 100)]
         skill = board.entry(name, "skill", 50)
         _, clear, tasks = board.wins(name, "gain", 50)
