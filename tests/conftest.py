@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,8 +28,10 @@ MEMORY = Path("/dev/shm")  # noqa: S108
 def pytest_configure() -> None:
     """Let the tests write into memory where it has room: flushing to a disk takes a third longer.
 
-    ``PYTEST_DEBUG_TEMPROOT`` names another place.
+    ``PYTEST_DEBUG_TEMPROOT`` names another place. A shell ignores Ctrl-C in its background jobs,
+    and their children inherit that: tests of Ctrl-C would wait for ever.
     """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > 4 << 30:
         os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
