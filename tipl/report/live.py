@@ -163,7 +163,7 @@ def summary(results: LiveResults, threshold: str = "90") -> str:
         name = escaped(arm_label(results, task, arm)) if arm else "-"
         found = _primary_figures(results, task, threshold)
         # How many trainings never arrive is in the long tables, which explain it.
-        texts = [_text(found.get(against), interval=True).partition(" (")[0] for against in others]
+        texts = [_number(found.get(against), interval=True) for against in others]
         count = len(chosen(results, task, results.baseline).curves)
         begun = f"{escaped(task)}, {count} {results.stage} seeds"
         lines.append(f"| {begun} | {name} | {' | '.join(texts)} |")
@@ -311,6 +311,14 @@ def _markdown(results: LiveResults, task: str, against: str) -> str:
 
 
 def _text(figure: Figure | None, interval: bool) -> str:
+    """Return a figure, and how many trainings of each arm never arrive, where some do not."""
+    text = _number(figure, interval)
+    if figure is not None and (figure.censored or figure.censored_against):
+        text += f" ({figure.censored}/{figure.censored_against} never)"
+    return text
+
+
+def _number(figure: Figure | None, interval: bool) -> str:
     """Return a ratio of steps, or a difference of returns in per cent, with its interval."""
     if figure is None or figure.value is None:
         return "-"
@@ -322,6 +330,4 @@ def _text(figure: Figure | None, interval: bool) -> str:
     text = told[0]
     if interval and len(told) == 3:
         text += f" [{told[1]}, {told[2]}]"
-    if figure.censored or figure.censored_against:
-        text += f" ({figure.censored}/{figure.censored_against} never)"
     return text

@@ -156,7 +156,7 @@ def read_table(folder: Path, name: str, rows: int) -> pa.Table:
             table = _decoded(table, text, limit)
         if len(table) != rows:
             raise ValueError(f"{len(table)} rows")
-        table.validate(full=True)  # text may be no text
+        table.validate(full=True)  # damaged text may not be UTF-8
     return table.replace_schema_metadata(None)  # what pandas wrote there is not needed
 
 
