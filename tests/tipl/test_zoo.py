@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,9 @@ def test_fitted_baselines_are_loaded_by_folder(
     command = ["tipl", "train", "baselines", "--data", str(small_dataset), "--out", str(tmp_path)]
     command += ["--steps", "20", "--horizons", "1", "5", "20"]
     monkeypatch.setattr(sys, "argv", command)
+    before = signal.getsignal(signal.SIGTERM)
     cli.main()
+    assert signal.getsignal(signal.SIGTERM) is before  # forked processes inherit it
     said = capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
     assert {"persistence", "ar-20-phase", "wnn"} < names

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import signal
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn, get_type_hints
 
 from tipl.training.checkpoint import read_log
@@ -33,8 +35,8 @@ def trainer(train: Callable[..., Any]) -> Callable[..., None]:
 
     def command(config: Any) -> None:
         new_path(config.out)
-        signal.signal(signal.SIGTERM, _stop)
-        found = train(config, console=Output())
+        with _stopped_by_sigterm():
+            found = train(config, console=Output())
         if rank_here() == 0:
             what = f"{len(found)} baselines" if isinstance(found, list) else "model"
             for line in curves(read_log(config.out)):
@@ -67,7 +69,24 @@ def _curve(name: str, points: list[tuple[float, float]]) -> str:
     return f"{name} {bars} {first}, {last}"
 
 
-def _stop(*_: object) -> NoReturn:
-    """Treat SIGTERM, with which `torchrun` and schedulers end a process, as Ctrl-C."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # some send it twice
-    raise KeyboardInterrupt
+@contextlib.contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """Treat SIGTERM, with which `torchrun` and schedulers end a process, as Ctrl-C meanwhile.
+
+    The handler before is put back at the end: processes forked later from a caller of ``main``
+    would inherit this one, and ``multiprocessing`` ends its workers by SIGTERM.
+    """
+
+    def stop(*_: object) -> NoReturn:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # some send it twice
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread gets signals
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        if signal.getsignal(signal.SIGTERM) is stop:  # else the process is ending
+            signal.signal(signal.SIGTERM, before)
