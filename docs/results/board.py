@@ -25,7 +25,7 @@ TASKS = {
 """Data sets of this repository."""
 ABLATION_TASKS = tuple(task for task in TASKS if TASKS[task] in ABLATION)
 """Tasks of the ablation from TIPL to tipl-gate."""
-SEEDS, ABLATION_SEEDS = (0, 1, 2), (0,)
+SEEDS, ABLATION_SEEDS = (0, 1, 2), (0, 1, 2)
 """Seeds of the trainings."""
 ABLATION_BATCHES = 1000
 """Number of batches of TIPL and of tipl-causal on the ablation."""

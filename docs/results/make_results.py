@@ -270,7 +270,6 @@ def page(rows: Sequence[TaskRow]) -> dict[str, str]:
         "transfer": transfer_table(weights),
         **({"paper": paper_table()} if PAPER.exists() else {}),
         "ablation": ablation_table(weights),
-        "commands": "\n".join(["```text", *cost_lines(plan()), "```"]),
     }
 
 

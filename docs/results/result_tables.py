@@ -60,7 +60,7 @@ def transfer_table(board: Board) -> str:
 
 
 def ablation_table(board: Board) -> str:
-    """Return the skill of each variant on the tasks of the ablation."""
+    """Return the skill of each variant on the tasks of the ablation, over runs and trainings."""
     tasks = ablation_tasks(board)
     heads = [f"{TASKS[task]}, h = {h}" for task in tasks for h in (1, 10)]
     lines = [
@@ -73,7 +73,7 @@ def ablation_table(board: Board) -> str:
         if not any(scores):
             continue
         count = max(score.trainings for score in scores if score)
-        cells = [cell(score and score.score, False) for score in scores]
+        cells = [cell(score and score.score) for score in scores]
         lines.append(f"| {told} | {count} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
