@@ -34,10 +34,12 @@ readme: demo ## write the numbers of the demo, the tables and the picture into t
 	$(BIN)/python docs/results/make_results.py
 	$(BIN)/tipl report docs/studies/live/test/results.json --into README.md
 	$(BIN)/tipl report docs/studies/live/test/results.json --into docs/live.md
-	$(BIN)/tipl report docs/studies/guarded/test/results.json --into docs/live.md
-	for stage in live/test live/tuning confirm/test confirm/tuning guarded/test guarded/tuning; do \
-		$(BIN)/tipl report docs/studies/$$stage/results.json --into docs/live-tables.md || exit 1; \
+	for study in guarded suite stretched; do \
+		$(BIN)/tipl report docs/studies/$$study/test/results.json --into docs/live.md || exit 1; \
 	done
+	for study in live confirm guarded suite stretched; do for stage in test tuning; do \
+		$(BIN)/tipl report docs/studies/$$study/$$stage/results.json --into docs/live-tables.md || exit 1; \
+	done; done
 	$(BIN)/tipl zoo --into README.md
 	$(BIN)/python datasets/pages.py
 	$(BIN)/python examples/plot_path_and_returns.py docs/path-and-returns.png

@@ -81,7 +81,6 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         )
     parts = []
     for task in wanted:
-        parts.append(verdict(results, task))
         parts.append(f"![Learning curves of {task}]({folder}/{task}.svg)")
         parts.append(f"![Ratios of environment steps, {task}]({folder}/{task}-ratios.svg)")
         if rows_of(results, task, results.baseline):
@@ -155,44 +154,27 @@ def summary(results: LiveResults, threshold: str = "90") -> str:
     others = _others(results)
     lines = [
         f"| task | tuned forecast | steps to {threshold} %, against "
-        f"{' | against '.join(map(escaped, others))} |",
-        f"|---|---|{'---:|' * len(others)}",
+        f"{' | against '.join(map(escaped, others))} | final return |",
+        f"|---|---|{'---:|' * (len(others) + 1)}",
     ]
     for task in results.thresholds:
         arm = results.primary.get(task)
         name = escaped(arm_label(results, task, arm)) if arm else "-"
-        found = _primary_figures(results, task, threshold)
+        found = _primary_figures(results, task, f"steps to {threshold} %")
+        final = _primary_figures(results, task, "final")
         # How many trainings never arrive is in the long tables, which explain it.
         texts = [_number(found.get(against), interval=True) for against in others]
+        texts.append(_number(final.get(others[0]), interval=True))
         count = len(chosen(results, task, results.baseline).curves)
         begun = f"{escaped(task)}, {count} {results.stage} seeds"
         lines.append(f"| {begun} | {name} | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 
-def _primary_figures(results: LiveResults, task: str, threshold: str) -> dict[str, Figure]:
-    """Return the ratios of steps of the primary arm, by the arm it is compared with."""
-    wanted = (task, results.primary.get(task), f"steps to {threshold} %")
+def _primary_figures(results: LiveResults, task: str, name: str) -> dict[str, Figure]:
+    """Return a figure of the primary arm, by the arm it is compared with."""
+    wanted = (task, results.primary.get(task), name)
     return {f.against: f for f in results.figures if (f.task, f.arm, f.name) == wanted}
-
-
-def verdict(results: LiveResults, task: str, threshold: str = "90") -> str:
-    """Return a sentence on the arm that was best on the tuning seeds, beside the other two."""
-    arm = results.primary.get(task)
-    told = [
-        f"{_text(figure, interval=True)} times {{}} of {escaped(arm_label(results, task, against))}"
-        for against, figure in _primary_figures(results, task, threshold).items()
-    ]
-    count = len(chosen(results, task, results.baseline).curves)
-    begun = f"**{escaped(task)}**, {count} {results.stage} seeds:"
-    if arm is None or not told:
-        return begun
-    what = ("the environment steps", *["those"] * (len(told) - 1))
-    needs = " and ".join(text.format(word) for text, word in zip(told, what, strict=True))
-    return (
-        f"{begun} to {threshold} % of the final return of {escaped(results.baseline)}, "
-        f"{escaped(arm_label(results, task, arm))} needs {needs}."
-    )
 
 
 def curves_figure(results: LiveResults, task: str, only: Sequence[str] = ()) -> Drawing:
@@ -277,12 +259,13 @@ def _others(results: LiveResults) -> list[str]:
 
 
 def _short(results: LiveResults, task: str, threshold: str = "90") -> str:
-    """Return a table of the most important figures: an arm a line."""
+    """Return a table of the most important figures: an arm a line, the primary one in bold."""
     others, name = _others(results), f"steps to {threshold} %"
+    count = len(chosen(results, task, results.baseline).curves)
     found = {(f.arm, f.against, f.name): f for f in results.figures if f.task == task}
     lines = [
-        f"| {escaped(task)} | {name}, against {' | against '.join(map(escaped, others))} | final | "
-        "worst decile | forecasts |",
+        f"| {escaped(task)}, {count} {results.stage} seeds | {name}, against "
+        f"{' | against '.join(map(escaped, others))} | final | worst decile | forecasts |",
         f"|---|{'---:|' * (len(others) + 3)}",
     ]
     for arm in rows_of(results, task, results.baseline):
@@ -290,7 +273,9 @@ def _short(results: LiveResults, task: str, threshold: str = "90") -> str:
         wanted += [(arm, results.baseline, column) for column in ("final", "worst decile")]
         texts = [_text(found.get(key), interval=True) for key in wanted]
         cost = cells(results, task, arm, results.baseline)[-1]
-        lines.append(f"| {escaped(arm_label(results, task, arm))} | {' | '.join(texts)} | {cost} |")
+        label = escaped(arm_label(results, task, arm))
+        label = f"**{label}**" if arm == results.primary.get(task) else label
+        lines.append(f"| {label} | {' | '.join(texts)} | {cost} |")
     return "\n".join(lines)
 
 
