@@ -13,8 +13,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace as replace_struct
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tipl
 import weighttraj as wt
@@ -24,12 +27,15 @@ from tipl.errors import EvaluateError, ForecastError
 from tipl.forecaster import Forecaster
 from tipl.growing import GrowingRun
 from tipl.live import ForecastCallback, IterationAverage, Jump, JumpConfig, PopulationJumps
+from tipl.live.config import known_every, known_horizons
 from tipl.live.guards import ReturnWatch, passes_batch
 from tipl.live.plan import ppo_of, read_plan
 from tipl.live.results import Cpu, Curve, Series, read_live
 from tipl.live.study import LiveConfig, run_live
-from tipl.live.summary import compare, mean_log_ratio, steps_to, thresholds_of
+from tipl.live.summary import compare, final_returns, mean_log_ratio, steps_to, thresholds_of
+from tipl.models.stretched import Stretched
 from tipl.registry import unfitted
+from tipl.saved import fingerprint
 from weighttraj.atomic import lock_of
 from weighttraj.collect import WeightTrajectoryCallback
 from weighttraj.collect.agents import find_agent
@@ -287,16 +293,54 @@ def test_a_population_without_jumps_has_the_bits_of_one_without_a_hook() -> None
     np.testing.assert_array_equal(plain, watched)
 
 
-def test_a_population_jumps_as_sb3_does() -> None:
-    """The same outer steps from the same seed, up to the rounding of float32."""
-    config = replace(SMALL, total_timesteps=192)
-    callback = ForecastCallback(IterationAverage(0.0), OUTER)
+@pytest.mark.parametrize(
+    ("forecaster", "options", "outcomes"),
+    [
+        (IterationAverage(0.0), {}, ["accepted"] * 3),
+        (IterationAverage(0.0), {"moments": "reset"}, ["accepted"] * 3),
+        (IterationAverage(0.0), {"guard": "batch"}, ["accepted"] * 3),
+        (IterationAverage(0.0), {"guard": "batch", "amplitude": -1.0}, ["refused"] * 3),
+        (Ahead(3.0), {"guard": "rollout", "last": 1}, ["undone"]),
+    ],
+    ids=["plain", "reset", "passes", "refused", "undone"],
+)
+@pytest.mark.parametrize("normalization", ["gymnasium", "vecnormalize"])
+def test_a_population_jumps_as_sb3_does(
+    normalization: Any, forecaster: Forecaster, options: Any, outcomes: list[str]
+) -> None:
+    """The same seed gives the same jumps and the same weights, up to the rounding of float32."""
+    config = replace(SMALL, total_timesteps=256, normalization=normalization)
+    jump = replace(OUTER, episodes=2, **options)
+    high = [1000.0, 1001.0]  # returns that the next rollout does not reach
+
+    class Watched(ForecastCallback):
+        def _on_rollout_start(self) -> None:
+            super()._on_rollout_start()
+            if self._iteration == 1:
+                self._watch.add(high)
+
+    callback = Watched(forecaster, jump)
     model = learn(config, callback)
-    _, jumps = trained(config, [3, 4], OUTER)
+    population = Population(config, origins_of(config, [3, 4]))
+    jumps = PopulationJumps(population, forecaster, jump, run_info(config))
+
+    def hook(boundary: Any) -> None:
+        jumps(boundary)
+        if boundary.iteration == 1:
+            jumps.learners[0]._watch.add(high)
+
+    population.train(jumps.watchers, hook=hook)
+    population.close()
+    assert [one.outcome for one in callback.jumps] == outcomes
+    assert [one.outcome for one in jumps.jumps[0]] == outcomes
     for one, other in zip(callback.jumps, jumps.jumps[0], strict=True):
         assert one.iteration == other.iteration
         assert one.size == pytest.approx(other.size, rel=1e-3)
-    assert model.num_timesteps == 192
+    learnt = population.read(0, critic=True)
+    agent = find_agent(model)
+    for rows, named in (("weights", agent.actor), ("critic", agent.critic)):
+        theirs = np.concatenate([p.detach().numpy().ravel() for p in named.values()])
+        np.testing.assert_allclose(learnt[rows], theirs, atol=1e-6)
 
 
 @pytest.mark.parametrize("normalization", ["gymnasium", "vecnormalize", "none"])
@@ -324,10 +368,14 @@ def test_a_population_undoes_a_bad_jump_of_one_learner(normalization: Any) -> No
     assert np.abs(np.diff(path._run.rows, axis=0)).max() < 1
     before, after = states
     assert torch.equal(before.parameters, after.parameters)
-    for name in before.moments:
-        assert torch.equal(before.moments[name], after.moments[name])
-    if before.obs_norm is not None:
-        np.testing.assert_array_equal(before.obs_norm[0], after.obs_norm[0])
+    assert before.adam["step"] == 8
+    for name in before.adam:
+        assert torch.equal(before.adam[name], after.adam[name])
+    for norm in ("obs_norm", "ret_norm"):
+        old, new = getattr(before, norm), getattr(after, norm)
+        assert (old is None) == (normalization == "none")
+        for one, other in zip(old or (), new or (), strict=True):
+            np.testing.assert_array_equal(one, other)
     plain, _ = trained(config, [3, 4, 5], None)
     np.testing.assert_array_equal(plain[1:], population.stack.values.numpy()[1:])
 
@@ -489,10 +537,94 @@ def test_a_bad_jump_is_undone_after_the_last_iteration_too() -> None:
         np.testing.assert_array_equal(before[name], values)
 
 
+def test_a_second_call_of_learn_continues_the_path() -> None:
+    """Its first iteration is one of its own, and no jump of the first call is taken back."""
+    callback = ForecastCallback(Ahead(0.001), replace(OUTER, guard="rollout", episodes=2))
+    model = learn(replace(SMALL, total_timesteps=128), callback)
+    callback._watch.add([1000.0, 1001.0])
+    before = parameters(model)
+    seen: list[dict[str, np.ndarray]] = []
+
+    class Seen(BaseCallback):
+        def _on_rollout_end(self) -> None:
+            seen.append(parameters(self.model))  # type: ignore[arg-type]
+
+        def _on_step(self) -> bool:
+            return True
+
+    model.learn(128, callback=[callback, Seen()], reset_num_timesteps=False)
+    for name, values in before.items():
+        np.testing.assert_array_equal(seen[0][name], values)
+    path = callback._path
+    assert path is not None
+    assert path._run.phase.tolist() == [-1, *[0, 1, 2, 3] * 4]
+    first, later = callback.jumps
+    assert (first.iteration, first.outcome, later.iteration) == (1, "accepted", 3)
+
+
+def test_the_rollout_guard_needs_the_returns_of_episodes() -> None:
+    env = DummyVecEnv([lambda: gym.make("InvertedPendulum-v4")])
+    settings: Any = {"n_steps": 64, "batch_size": 16, "n_epochs": 1, "device": "cpu"}
+    callback = ForecastCallback("last-iteration", replace(OUTER, guard="rollout"))
+    with pytest.raises(ForecastError, match="Monitor"):
+        PPO("MlpPolicy", env, **settings).learn(128, callback=callback)
+    PPO("MlpPolicy", env, **settings).learn(128, callback=ForecastCallback("last-step", OUTER))
+
+
+def test_horizons_and_cadence_of_a_stretched_forecaster_are_its_own() -> None:
+    for name in ("ar-20-phase", "tipl-gate", "tipl-causal"):
+        along = tipl.load(f"{name}-inverted-pendulum-v4")
+        stretched = Stretched(along, {1: 2.0})
+        assert known_horizons(stretched) == known_horizons(along) is not None
+        assert known_every(stretched) == known_every(along)
+    assert known_every(tipl.load("tipl-drift-inverted-pendulum-v4")) == 64
+    assert known_horizons(tipl.load("last-step")) is None
+
+
+def test_a_test_needs_the_tuning_of_its_own_plan(plan: Path) -> None:
+    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning")
+    run_live(config)
+    plan.write_text(PLAN.replace("first = 1", "first = 2"))
+    with pytest.raises(EvaluateError, match="or the plan was changed since"):
+        run_live(replace(config, stage="test"))
+    plan.write_text(PLAN)
+    results = run_live(replace(config, stage="test", tasks=("pendulum",)))
+    assert len(results.series) == 3
+
+
+def test_trainings_with_another_forecaster_are_made_again(
+    plan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder whose model has changed since, not a name alone."""
+    monkeypatch.chdir(plan.parent)
+    plan.write_text(
+        PLAN.replace('"last-iteration"\njump = { horizon = 50', '"m"\njump = { horizon = 50')
+    )
+    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning", arms=("far",))
+    for decay in (0.9, 0.95):
+        tipl.load(f"ema-{decay}").save("m")
+        run_live(config)
+        made = json.loads((config.out / "tuning/pendulum/far/10-11.json").read_bytes())
+        assert made["fingerprint"] == fingerprint(tipl.load("m"))
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [({"tasks": ("ppo",)}, "no such task"), ({"arms": ("pendulum",)}, "no such arm")],
+)
+def test_tasks_and_arms_that_the_plan_lacks_are_refused(
+    plan: Path, names: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(EvaluateError, match=told):
+        run_live(LiveConfig(plan=plan, out=plan.parent / "out", **names))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
         ('rival = "outer"', 'rival = "none"', "no arm 'none'"),
+        ('"20:23"', '"20:23,22:24"', "seeds \\[22\\] stand twice"),
+        ("bootstrap = 50", "bootstrap = 0", "bootstrap is at least 1"),
         ('"20:23"', '"11:23"', "for tuning and for the test"),
         ("horizon = 4", "horison = 4", "no settings"),
         ("horizon = 4", "horizon = 0", "horizon of at least 1"),
@@ -544,6 +676,30 @@ def test_steps_to_a_return_are_interpolated_paired_and_censored(plan: Path) -> N
     assert (ratio.censored, ratio.censored_against) == (1, 0)
     assert found["worst decile"].value == pytest.approx(-1)
     assert mean_log_ratio(study, line("far", fast), line("ppo", slow), limits) < 0
+
+
+def test_final_returns_the_worst_tenth_and_the_score_are_as_defined(plan: Path) -> None:
+    evaluation = replace_struct(read_plan(plan).evaluation, last=0.1)
+    rising = line("far", [float(i) for i in range(20)], [10.0] * 20)
+    assert final_returns(rising, evaluation).tolist() == [18.5, 10.0]  # the last 2 of 20
+    study = read_plan(plan)
+    mine = line("far", *([float(i)] * 5 for i in range(1, 21)))
+    others = line("ppo", *([10.0] * 5 for _ in range(20)))
+    found = {figure.name: figure for figure in compare(study, mine, others, {"50": 5.0})}
+    assert found["worst decile"].value == pytest.approx((1.5 - 10) / 10)  # 2 of 20 runs
+    never, late = [0.0] * 5, [0.0, 0, 0, 0, 10]
+    pair = line("far", never, late), line("ppo", late, never)
+    expected = np.log([2 * 400 / 350, 350 / (2 * 400)]).mean()
+    smooth = replace_struct(study, evaluation=replace_struct(study.evaluation, smooth=1))
+    assert mean_log_ratio(smooth, *pair, {"50": 5.0}) == pytest.approx(expected)
+    assert mean_log_ratio(smooth, pair[0], pair[0], {"50": 5.0}) == 0
+
+
+def test_the_mean_of_several_evaluations_must_reach_a_threshold(plan: Path) -> None:
+    evaluation = replace_struct(read_plan(plan).evaluation, smooth=3)
+    # Means of three: 0, 3, 2, 4, 8. From 2 at 200 to 4 at 300 steps: 3.5 at 275.
+    steps, censored = steps_to(line("far", [0.0, 6, 0, 6, 18]), 3.5, evaluation)
+    assert (steps.tolist(), censored) == ([275.0], 0)
 
 
 def test_an_average_of_iterations_follows_whole_iterations() -> None:

@@ -316,6 +316,8 @@ def test_a_log_is_thinned_evenly_on_a_logarithmic_scale(tmp_path: Path) -> None:
     assert batches == sorted(set(batches))
     assert batches[len(batches) // 2] < 100
     assert found[0] == {"batch": 1, "wpe": 1.0}
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines[:7]))
+    assert [line["batch"] for line in thinned(log)] == [1, 2, 3, 4, 5, 6, 7]  # short: all
     assert thinned(tmp_path / "nothing.jsonl") == []
 
 

@@ -16,6 +16,7 @@ from tipl.live.path import forecaster_of
 from tipl.live.plan import Evaluation, Trial
 from tipl.live.population import PopulationJumps
 from tipl.live.results import Cpu, Curve
+from tipl.saved import fingerprint
 from tipl.threads import threads
 from weighttraj import RunInfo
 from weighttraj.atomic import acquired, lock_of, replace_file
@@ -42,6 +43,8 @@ class Block(msgspec.Struct, frozen=True, kw_only=True):
     """Gradient steps between the recipe's snapshots."""
     evaluation: Evaluation
     seeds: list[int]
+    fingerprint: str = ""
+    """What ``Made.fingerprint`` must be, if the file has one; empty: anything."""
 
     @property
     def lock(self) -> Path:
@@ -68,15 +71,19 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
     num_timesteps: list[int]
     curves: list[Curve]
     cpu: Cpu
+    fingerprint: str = ""
+    """SHA-256 of the forecaster's files; empty: there is none, or it was not recorded."""
 
 
 def read_block(block: Block) -> Made | None:
-    """Return what a block's file holds; None: it is not there, or of other settings."""
+    """Return what a block's file holds; None: not there, or of other settings or forecaster."""
     try:
         made = msgspec.json.decode(block.file.read_bytes(), type=Made)
     except (FileNotFoundError, ValueError):
         return None
     wanted = msgspec.json.decode(msgspec.json.encode(block.source))
+    if made.fingerprint and block.fingerprint not in ("", made.fingerprint):
+        return None
     return made if made.source == wanted else None
 
 
@@ -123,6 +130,7 @@ class _Training:
         self._steps: list[int] = []
         self._returns: list[np.ndarray] = []
         self._evaluating = 0.0
+        self._fingerprint = ""
 
     def run(self) -> Made:
         """Train to the end."""
@@ -139,6 +147,7 @@ class _Training:
             jumps = None
             if trial.forecaster:
                 forecaster = forecaster_of(trial.forecaster)
+                self._fingerprint = fingerprint(forecaster)
                 clip, count = self._config.clip_range, len(block.seeds)
                 jumps = PopulationJumps(
                     population, forecaster, trial.jump, info, clip_range=clip, learners=count
@@ -195,6 +204,7 @@ class _Training:
                 forecasts=jumps.seconds if jumps else 0.0,
                 evaluation=self._evaluating,
             ),
+            fingerprint=self._fingerprint,
         )
 
 

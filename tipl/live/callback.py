@@ -49,7 +49,10 @@ class ForecastCallback(BaseCallback):
     The critic stays as it is, and so does the exploration noise ``log_std`` unless ``config`` says
     otherwise. Training is the same, bit by bit, as long as no jump is made. Beside a
     ``WeightTrajectoryCallback`` of the same training, the jumps are written to ``RUN.jumps.json``
-    when training ends.
+    when training ends. The recorded run ends with the last gradient step: if the guard ``rollout``
+    undoes the last jump after it, the trained model is not the last snapshot.
+
+    A second call of ``learn`` continues the path and the jumps of the first one.
 
     Args:
         forecaster: a folder, a name or an address for ``tipl.load``, or the forecaster itself.
@@ -59,7 +62,7 @@ class ForecastCallback(BaseCallback):
 
     Raises:
         ForecastError: the forecaster needs the future of the run; or (when training starts) the
-            model is no PPO.
+            model is no PPO; or (when an episode ends) the guard ``rollout`` cannot see its return.
         ModelError: (at the first jump) the forecaster was trained on another cadence.
     """
 
@@ -108,10 +111,7 @@ class ForecastCallback(BaseCallback):
         self._agent = find_agent(self.model)
         if self._path is None:  # a second call of learn() goes on with the same path
             layout = describe_layout(self._agent.actor, describe_agent(self._agent, ()))
-            steps = self.model.n_epochs * -(
-                -self.model.n_steps * self.model.n_envs // self.model.batch_size
-            )
-            self._path = TrainingPath(self._forecaster, self.config, layout, self._weights(), steps)
+            self._path = TrainingPath(self._forecaster, self.config, layout, self._weights())
         if self._hook is not None:  # an exception ended the call of learn() before
             self._hook.remove()
         optimizer = cast(torch.optim.Optimizer, self._agent.optimizer)
@@ -119,9 +119,16 @@ class ForecastCallback(BaseCallback):
         self._trained = False
 
     def _on_step(self) -> bool:
-        for info in self.locals.get("infos", ()):
+        for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
             if (episode := info.get("episode")) is not None:
                 self._returns.append(float(np.asarray(episode["r"]).item()))
+            elif done and self.config.guard == "rollout":
+                raise ForecastError(
+                    "an episode ended and nothing told its return, which the guard needs",
+                    expected="an environment in Stable-Baselines3's Monitor or VecMonitor",
+                    got="an info without 'episode'",
+                    do="wrap the environment in Monitor, or choose another guard",
+                )
         return True
 
     def _on_rollout_end(self) -> None:
@@ -281,6 +288,8 @@ class ForecastCallback(BaseCallback):
         self._hook.remove()
         if self._before is not None and self._fallen:
             self._undo(self._weights(), self._before)
+        self._before = None
+        cast(TrainingPath, self._path).end_iteration(self._weights())
         paths = [_beside(recorder.path) for recorder in _recorders(self.locals.get("callback"))]
         for path in [self._log] if self._log is not None else paths:
             content = msgspec.json.encode([asdict(jump) for jump in self.jumps])

@@ -119,15 +119,28 @@ class Jump:
 
 def known_horizons(forecaster: Forecaster) -> tuple[int, ...] | None:
     """Return the horizons that a forecaster was fitted for; None: it forecasts any."""
-    config: Any = getattr(forecaster, "config", None)
-    network = getattr(config, "network", None)
-    places = (network, getattr(forecaster, "gate", None), forecaster)
-    for place in places:
+    fitted = _without_stretch(forecaster)
+    config = getattr(fitted, "config", None)
+    for place in (getattr(config, "network", None), config, fitted):
         if isinstance(found := getattr(place, "horizons", None), tuple) and found:
             return found
-    if gate := getattr(forecaster, "gate", None):
-        return tuple(gate.config.network.horizons)
     return None
+
+
+def known_every(forecaster: Forecaster) -> int | None:
+    """Return the gradient steps between snapshots that a forecaster was fitted for; None: any."""
+    found: int | None = getattr(
+        getattr(_without_stretch(forecaster), "config", None), "every", None
+    )
+    return found
+
+
+def _without_stretch(forecaster: Any) -> Any:
+    """Return the forecaster whose displacement a stretched one makes longer, or itself."""
+    for name in ("gate", "along"):
+        if (inner := getattr(forecaster, name, None)) is not None:
+            return _without_stretch(inner)
+    return forecaster
 
 
 def _no_schedule(got: object) -> ForecastError:

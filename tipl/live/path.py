@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Float64
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster, check_forecaster
 from tipl.growing import GrowingRun
-from tipl.live.config import Jump, JumpConfig, known_horizons
+from tipl.live.config import Jump, JumpConfig, known_every, known_horizons
 from tipl.registry import load
 from weighttraj import ParamLayout, RunInfo
 from weighttraj.collect.undisturbed import undisturbed
@@ -45,20 +45,6 @@ def forecaster_of(forecaster: str | Path | Forecaster) -> Forecaster:
     return forecaster
 
 
-def every_of(forecaster: Forecaster, config: JumpConfig, default: int = EVERY) -> int:
-    """Return the number of gradient steps between two snapshots of the path.
-
-    Args:
-        forecaster: fitted ones know the cadence of their training runs.
-        config: its ``every`` comes first.
-        default: of forecasters of any cadence.
-    """
-    trained = getattr(getattr(forecaster, "config", None), "every", None)
-    if trained is None:
-        trained = getattr(getattr(getattr(forecaster, "gate", None), "config", None), "every", None)
-    return config.every or trained or default
-
-
 class TrainingPath:
     """The path of one training, and forecasts from its end.
 
@@ -67,7 +53,6 @@ class TrainingPath:
         config: when and how far the training jumps.
         layout: order of the parameters.
         weights: policy weights before training.
-        gradient_steps: number of gradient steps of one iteration; None: it varies.
         every: number of gradient steps between snapshots for forecasters of any cadence.
     """
 
@@ -77,7 +62,6 @@ class TrainingPath:
         config: JumpConfig,
         layout: ParamLayout,
         weights: Float32[np.ndarray, " param"],
-        gradient_steps: int | None,
         every: int = EVERY,
     ) -> None:
         self.jumps: list[Jump] = []
@@ -85,10 +69,10 @@ class TrainingPath:
         self.seconds = 0.0
         """CPU time of forecasts and of keeping the path."""
         self._forecaster, self._config = forecaster, config
-        self._every = every_of(forecaster, config, every)
+        self._every = config.every or known_every(forecaster) or every
         self._known = known_horizons(forecaster)
-        cadence = Cadence(every=self._every, gradient_steps_per_iteration=gradient_steps)
-        self._run = GrowingRun(RunInfo(run_id="live", layout=layout, cadence=cadence))
+        info = RunInfo(run_id="live", layout=layout, cadence=Cadence(every=self._every))
+        self._run = GrowingRun(info)
         self._moves = _moving(layout, config)
         self._offset: Float64[np.ndarray, " param"] | None = None
         self._step = self._step_before = 0
@@ -113,6 +97,14 @@ class TrainingPath:
         self._append(weights, iteration, num_timesteps, phase, learning_rate)
         self.seconds += time.process_time() - begun
 
+    def end_iteration(self, weights: Float32[np.ndarray, " param"]) -> None:
+        """Note that the next gradient step begins an iteration.
+
+        Args:
+            weights: policy weights now.
+        """
+        self._step_before, self._before = self._step, np.array(weights)
+
     def propose(
         self,
         weights: Float32[np.ndarray, " param"],
@@ -129,8 +121,8 @@ class TrainingPath:
             remaining: share of the training that is still to come.
         """
         begun = time.process_time()
-        self._step_before = self._step
-        own, self._before = weights - self._before, np.array(weights)
+        own = weights - self._before
+        self.end_iteration(weights)
         horizon = None
         if self._config.is_due(iteration) and remaining > 0:
             horizon = self._config.horizon_at(iteration, remaining, self._known)
@@ -155,10 +147,9 @@ class TrainingPath:
 
         Such changes come at iteration boundaries only.
         """
-        self._step_before = self._step
         change = after.astype(np.float64) - before
         self._offset = change if self._offset is None else self._offset + change
-        self._before = np.array(after)
+        self.end_iteration(after)
 
     def _displacement(self, horizon: int, remaining: float) -> Float32[np.ndarray, " param"] | None:
         """Return how far the policy is to move; None: not at all, or the forecast is not finite."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -169,8 +169,9 @@ def _check(plan: Plan) -> None:
     for name in filter(None, (plan.baseline, plan.rival)):
         if name not in plan.arms:
             raise ValueError(f"no arm {name!r}; there are {', '.join(plan.arms)}")
-    if both := {*plan.seeds_of("tuning")} & {*plan.seeds_of("test")}:
-        raise ValueError(f"seeds {sorted(both)} are for tuning and for the test")
+    if not plan.thresholds or min(plan.thresholds) <= 0 or plan.bootstrap < 1:
+        raise ValueError("thresholds are shares above 0, and bootstrap is at least 1")
+    _check_seeds(plan.seeds_of("tuning"), plan.seeds_of("test"))
     for name, arm in plan.arms.items():
         if missing := {*arm.tasks} - {*plan.tasks}:
             raise ValueError(f"arm {name!r}: no tasks {sorted(missing)}")
@@ -179,6 +180,14 @@ def _check(plan: Plan) -> None:
         if min(evaluation.every, evaluation.episodes, evaluation.smooth, plan.population) < 1:
             raise ValueError("every, episodes, smooth and population are at least 1")
         plan.trials(task)
+
+
+def _check_seeds(tuning: Sequence[int], test: Sequence[int]) -> None:
+    if both := {*tuning} & {*test}:
+        raise ValueError(f"seeds {sorted(both)} are for tuning and for the test")
+    for stage, seeds in (("tuning", tuning), ("test", test)):
+        if twice := sorted({seed for seed in seeds if seeds.count(seed) > 1}):
+            raise ValueError(f"seeds {twice} stand twice in those for {stage}")
 
 
 def _trials(name: str, arm: Arm, names: Mapping[str, str]) -> Iterator[Trial]:

@@ -15,7 +15,6 @@ from tipl.live.guards import ReturnWatch, passes_batch, surrogate
 from tipl.live.path import EVERY, TrainingPath
 from weighttraj import RunInfo
 from weighttraj.collect.population import Boundary, LearnerState, Population
-from weighttraj.format.schema import Cadence
 from weighttraj.policies import Policy
 
 
@@ -88,12 +87,9 @@ class _Learner:
         self._watch = ReturnWatch(config)
         self._before: tuple[Jump, LearnerState] | None = None
         self._iteration = 0
-        cadence = info.cadence or Cadence(every=EVERY)
-        steps = cadence.gradient_steps_per_iteration
+        every = info.cadence.every if info.cadence else EVERY
         weights = population.weights(learner)
-        self.path = TrainingPath(
-            forecaster, config, info.layout, weights, steps, every=cadence.every
-        )
+        self.path = TrainingPath(forecaster, config, info.layout, weights, every=every)
 
     def end_rollout(self, returns: Sequence[Any], inputs: np.ndarray) -> None:
         """See ``Recorder``."""

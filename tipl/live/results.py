@@ -8,7 +8,6 @@ from typing import Any
 import msgspec
 
 from tipl.errors import EvaluateError
-from weighttraj.atomic import replace_file
 
 SCHEMA = 1
 """Version of the schema."""
@@ -128,9 +127,3 @@ def is_live(file: Path) -> bool:
     """Say whether a file holds results of a study, and not those of an evaluation."""
     with file.open("rb") as opened:
         return b'"live":' in opened.read(64)
-
-
-def write_json(file: Path, document: Any) -> None:
-    """Write a document as indented JSON."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(file, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")

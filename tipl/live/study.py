@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from tipl.errors import EvaluateError
+from tipl.evaluation.results import write_document
 from tipl.live.block import Block, Made, make_block, read_block, wait_for
+from tipl.live.path import forecaster_of
 from tipl.live.plan import Plan, Stage, Trial, ppo_of, read_plan, settings_of
-from tipl.live.results import Cpu, Figure, LiveResults, Series, read_live, write_json
+from tipl.live.results import Cpu, Figure, LiveResults, Series
 from tipl.live.summary import compare, final, mean_log_ratio, thresholds_of
+from tipl.saved import fingerprint
 from weighttraj.atomic import replace_file
 from weighttraj.engine import engine_of
 from weighttraj.errors import StoreLockedError, WeightTrajError
@@ -43,8 +46,6 @@ class LiveConfig:
     arms: tuple[str, ...] = ()
     """Arms to train; empty: all of the plan. The baseline always runs.
     Results also hold the arms that were trained earlier."""
-    seeds: int | None = None
-    """Number of seeds, the first ones; unset: all of the stage."""
     workers: int = 1
     """Number of processes; each takes a population of seeds at a time."""
     scheduler: str | None = None
@@ -56,42 +57,89 @@ def run_live(
 ) -> LiveResults:
     """Train what is missing, and write ``results.json`` and ``curves.csv``.
 
-    Each population of seeds is a file; those that are there and have the same settings are left
-    alone. So a study that was stopped goes on with the same command, and several commands can share
-    the work: none trains a population that another one is training. The results hold every arm of
-    the plan whose trainings are all there, those of earlier commands too.
+    Each population of seeds is a file. Those that are there are left alone, if they have the same
+    settings and forecaster. So the same command continues a study that was stopped, and several
+    commands can share the work: none trains a population that another one is training. The results
+    hold every arm of the plan whose trainings are all there, those of earlier commands too.
 
     Raises:
         EvaluateError: the plan is invalid, or the stage ``test`` comes before the tuning.
+        ForecastError: a forecaster needs the future of the run.
         KeyboardInterrupt: it was stopped; finished populations are kept.
     """
     plan = read_plan(config.plan)
-    missing = [block for block in _blocks(plan, config) if read_block(block) is None]
-    _make(missing, config, console)
-    series = _series(plan, config)
-    results = _results(plan, config, series, command)
-    folder = config.out / config.stage
-    write_json(folder / RESULTS, results)
-    replace_file(folder / "curves.csv", _csv(series).encode())
-    return results
+    _check_names(plan, config)
+    tuned = None
+    if config.stage == "test":
+        whole = replace(config, stage="tuning", tasks=(), arms=())
+        tuned = _Ranked.of(plan, _series(plan, whole))
+    blocks = _marked(_blocks(plan, config, tuned))
+    _make([block for block in blocks if read_block(block) is None], config, console)
+    folder, series = config.out / config.stage, _series(plan, config, tuned)
+    while True:
+        results = _results(plan, config, series, tuned, command)
+        write_document(folder / RESULTS, results)
+        replace_file(folder / "curves.csv", _csv(series).encode())
+        before, series = series, _series(plan, config, tuned)
+        if series == before:  # no other command has finished a training in the meantime
+            return results
 
 
-def _blocks(plan: Plan, config: LiveConfig) -> Iterator[Block]:
-    """Yield the populations of a stage."""
-    for name in (*config.tasks, *config.arms):
-        if name not in plan.tasks and name not in plan.arms:
-            raise EvaluateError(
-                "the plan has no such task or arm",
-                expected=", ".join((*plan.tasks, *plan.arms)),
-                got=name,
-                where=config.plan,
-                do="name tasks with --tasks and arms with --arms",
-            )
-    seeds = plan.seeds_of(config.stage)[: config.seeds]
+@dataclass(frozen=True)
+class _Ranked:
+    """What the trainings of a stage say of the trials."""
+
+    best: dict[str, dict[str, str]]
+    """Best trial of each arm, by task and arm."""
+    scores: dict[str, dict[str, float]]
+    """What tuning minimises, by task and trial."""
+
+    @classmethod
+    def of(cls, plan: Plan, series: Sequence[Series]) -> _Ranked:
+        found = cls({}, {})
+        for task in dict.fromkeys(one.task for one in series):
+            mine = [one for one in series if one.task == task]
+            (baseline,) = (one for one in mine if one.arm == plan.baseline)
+            limits = thresholds_of(plan, baseline)
+            score = found.scores[task] = {
+                one.trial: math.exp(mean_log_ratio(plan, one, baseline, limits)) for one in mine
+            }
+            found.best[task] = {
+                arm: min((one.trial for one in mine if one.arm == arm), key=score.__getitem__)
+                for arm in dict.fromkeys(one.arm for one in mine)
+            }
+        return found
+
+
+def _check_names(plan: Plan, config: LiveConfig) -> None:
+    for what, given, known in (
+        ("task", config.tasks, plan.tasks),
+        ("arm", config.arms, plan.arms),
+    ):
+        for name in given:
+            if name not in known:
+                raise EvaluateError(
+                    f"the plan has no such {what}",
+                    expected=", ".join(known),
+                    got=name,
+                    where=config.plan,
+                    do=f"name some of these with --{what}s",
+                )
+
+
+def _blocks(plan: Plan, config: LiveConfig, tuned: _Ranked | None) -> Iterator[Block]:
+    """Yield the populations of a stage.
+
+    Args:
+        plan: the study.
+        config: stage, tasks and arms.
+        tuned: what the tuning says; needed for the stage ``test`` only.
+    """
+    seeds = plan.seeds_of(config.stage)
     groups = [seeds[i : i + plan.population] for i in range(0, len(seeds), plan.population)]
     for task in config.tasks or plan.tasks:
         ppo, every = ppo_of(plan, task, config.plan.parent)
-        for trial in _trials(plan, config, task):
+        for trial in _trials(plan, config, task, tuned):
             for group in groups:
                 name = f"{group[0]}-{group[-1]}.json"
                 yield Block(
@@ -105,7 +153,17 @@ def _blocks(plan: Plan, config: LiveConfig) -> Iterator[Block]:
                 )
 
 
-def _trials(plan: Plan, config: LiveConfig, task: str) -> Iterator[Trial]:
+def _marked(blocks: Iterable[Block]) -> Iterator[Block]:
+    """Yield blocks with the fingerprints of their forecasters, each of which is loaded once."""
+    marks: dict[str, str] = {"": ""}
+    for block in blocks:
+        name = block.trial.forecaster
+        if name not in marks:
+            marks[name] = fingerprint(forecaster_of(name))
+        yield msgspec.structs.replace(block, fingerprint=marks[name])
+
+
+def _trials(plan: Plan, config: LiveConfig, task: str, tuned: _Ranked | None) -> Iterator[Trial]:
     """Yield the trials of a stage on a task: all of them, or the best of each arm."""
     for arm, trials in plan.trials(task).items():
         if config.arms and arm not in (*config.arms, plan.baseline):
@@ -113,22 +171,17 @@ def _trials(plan: Plan, config: LiveConfig, task: str) -> Iterator[Trial]:
         if config.stage == "tuning" or len(trials) == 1:
             yield from trials
         else:
-            yield _tuned(config, task, arm, trials)
-
-
-def _tuned(config: LiveConfig, task: str, arm: str, trials: Sequence[Trial]) -> Trial:
-    """Return the arm's best trial on the tuning seeds."""
-    file = config.out / "tuning" / RESULTS
-    best = read_live(file).best.get(task, {}).get(arm) if file.exists() else None
-    for trial in trials:
-        if trial.name == best:
-            return trial
-    raise EvaluateError(
-        "the arm has a grid, and was not tuned",
-        expected=f"the best point of its grid in {file}",
-        got=f"{best or 'nothing'} of arm {arm!r} on task {task!r}",
-        do=f"run: tipl live {config.plan} --out {config.out} --stage tuning",
-    )
+            best = tuned.best.get(task, {}).get(arm) if tuned else None
+            if best is None:
+                raise EvaluateError(
+                    "an arm with a grid was not tuned, or the plan was changed since",
+                    expected=f"trainings of all points of its grid, and of {plan.baseline!r}, on "
+                    "the tuning seeds",
+                    got=f"not all of arm {arm!r} on task {task!r}",
+                    where=config.out / "tuning",
+                    do=f"run: tipl live {config.plan} --out {config.out} --stage tuning",
+                )
+            yield next(trial for trial in trials if trial.name == best)
 
 
 def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) -> None:
@@ -160,7 +213,7 @@ def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) 
                 wait_for(blocks[0])
 
 
-def _series(plan: Plan, config: LiveConfig) -> list[Series]:
+def _series(plan: Plan, config: LiveConfig, tuned: _Ranked | None = None) -> list[Series]:
     """Return the trainings of each trial on each task, of the arms whose trainings are all there.
 
     A task is left out where those of the baseline are not.
@@ -169,18 +222,18 @@ def _series(plan: Plan, config: LiveConfig) -> list[Series]:
     for task in plan.tasks:
         made: dict[str, list[Series]] = {}
         for arm in plan.arms:
-            if found := _finished(plan, replace(config, tasks=(task,), arms=(arm,)), arm):
+            if found := _finished(plan, replace(config, tasks=(task,), arms=(arm,)), arm, tuned):
                 made[arm] = found
         if plan.baseline in made:
             series += [one for found in made.values() for one in found]
     return series
 
 
-def _finished(plan: Plan, config: LiveConfig, arm: str) -> list[Series]:
+def _finished(plan: Plan, config: LiveConfig, arm: str, tuned: _Ranked | None) -> list[Series]:
     """Return the trainings of each trial of an arm on a task; empty: some are missing."""
     pairs: dict[str, list[tuple[Block, Made]]] = {}
     try:
-        blocks = [block for block in _blocks(plan, config) if block.trial.arm == arm]
+        blocks = [block for block in _blocks(plan, config, tuned) if block.trial.arm == arm]
     except (WeightTrajError, OSError):  # not tuned, or a recipe of another task cannot be read
         return []
     for block in blocks:
@@ -205,36 +258,24 @@ def _joined(pairs: Sequence[tuple[Block, Made]]) -> Series:
     )
 
 
-def _results(plan: Plan, config: LiveConfig, series: Sequence[Series], command: str) -> LiveResults:
+def _results(
+    plan: Plan, config: LiveConfig, series: Sequence[Series], tuned: _Ranked | None, command: str
+) -> LiveResults:
     thresholds: dict[str, dict[str, float]] = {}
     finals: dict[str, dict[str, float]] = {}
-    best: dict[str, dict[str, str]] = {}
-    scores: dict[str, dict[str, float]] = {}
+    ranked = _Ranked.of(plan, series)
     figures: list[Figure] = []
     for task in dict.fromkeys(one.task for one in series):
         mine = [one for one in series if one.task == task]
         (baseline,) = (one for one in mine if one.arm == plan.baseline)
         limits = thresholds[task] = thresholds_of(plan, baseline)
         finals[task] = {one.trial: final(one, plan.evaluation_of(task)) for one in mine}
-        score = scores[task] = {
-            one.trial: math.exp(mean_log_ratio(plan, one, baseline, limits)) for one in mine
-        }
-        best[task] = {
-            arm: min((one.trial for one in mine if one.arm == arm), key=score.__getitem__)
-            for arm in dict.fromkeys(one.arm for one in mine)
-        }
-        chosen = [one for one in mine if best[task][one.arm] == one.trial]
+        chosen = [one for one in mine if ranked.best[task][one.arm] == one.trial]
         rivals = [one for one in chosen if one.arm in (plan.baseline, plan.rival)]
         for other in rivals:
             for one in chosen:
                 if one.arm != other.arm:
                     figures += compare(plan, one, other, limits)
-    file = config.out / "tuning" / RESULTS
-    if config.stage == "test" and file.exists():
-        earlier = read_live(file)
-        tuned = earlier.best, earlier.scores
-    else:
-        tuned = best, scores
     builtins: dict[str, Any] = msgspec.to_builtins(plan)
     return LiveResults(
         study=plan.id,
@@ -244,34 +285,29 @@ def _results(plan: Plan, config: LiveConfig, series: Sequence[Series], command: 
         plan=builtins,
         thresholds=thresholds,
         final=finals,
-        best=best,
-        scores=scores,
-        primary=_primary(plan, tuned, best),
+        best=ranked.best,
+        scores=ranked.scores,
+        primary=_primary(plan, tuned or ranked, ranked.best),
         series=list(series),
         figures=figures,
         command=command,
     )
 
 
-def _primary(
-    plan: Plan,
-    tuned: tuple[Mapping[str, Mapping[str, str]], Mapping[str, Mapping[str, float]]],
-    best: Mapping[str, Mapping[str, str]],
-) -> dict[str, str]:
+def _primary(plan: Plan, tuned: _Ranked, best: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
     """Return by task the arm that forecasts and was best on the tuning seeds, the rival aside.
 
     Args:
         plan: the study.
-        tuned: best trials and scores of the tuning seeds.
+        tuned: what the tuning says.
         best: best trials of this stage; their arms are looked at.
     """
-    trials, scores = tuned
     found = {}
     for task, arms in best.items():
         ranked = {
-            arm: scores[task][trials[task][arm]]
+            arm: tuned.scores[task][tuned.best[task][arm]]
             for arm in arms
-            if arm in trials.get(task, {}) and plan.arms[arm].forecaster and arm != plan.rival
+            if arm in tuned.best.get(task, {}) and plan.arms[arm].forecaster and arm != plan.rival
         }
         if ranked:
             found[task] = min(ranked, key=ranked.__getitem__)

@@ -23,17 +23,16 @@ Thresholds = dict[str, float]
 
 
 def returns_of(series: Series) -> Float[np.ndarray, "seed evaluation"]:
-    """Return J of all trainings; NaN where a simulation became unstable."""
-    return np.array([curve.returns for curve in series.curves], np.float64)
+    """Return J of all trainings; the least of all where a simulation became unstable."""
+    returns = np.array([curve.returns for curve in series.curves], np.float64)
+    return np.nan_to_num(returns, nan=float(np.nanmin(returns)))
 
 
 def final_returns(series: Series, evaluation: Evaluation) -> Float[np.ndarray, " seed"]:
     """Return the mean return of the last evaluations of each training."""
     returns = returns_of(series)
     last = max(1, round(evaluation.last * returns.shape[1]))
-    return np.asarray(
-        np.nan_to_num(returns[:, -last:], nan=float(np.nanmin(returns))).mean(1), np.float64
-    )
+    return np.asarray(returns[:, -last:].mean(1), np.float64)
 
 
 def final(series: Series, evaluation: Evaluation) -> float:
@@ -61,7 +60,6 @@ def steps_to(
     """
     steps = np.array(series.num_timesteps, np.float64)
     returns = returns_of(series)
-    returns = np.nan_to_num(returns, nan=float(np.nanmin(returns)))
     found, censored = np.full(len(returns), steps[-1]), 0
     for place, row in enumerate(returns):
         sums = np.cumsum(np.concatenate([[0.0], row]))
@@ -92,7 +90,7 @@ def compare(plan: Plan, arm: Series, against: Series, thresholds: Thresholds) ->
     pair = final_returns(arm, evaluation), final_returns(against, evaluation)
     (cell,) = bootstrap.interval(_difference, *pair)
     yield Figure(**about | {"name": "final"} | cell)
-    means = np.nanmean(returns_of(arm), 1), np.nanmean(returns_of(against), 1)
+    means = returns_of(arm).mean(1), returns_of(against).mean(1)
     (cell,) = bootstrap.interval(_difference, *means)
     yield Figure(**about | {"name": "area"} | cell)
     (cell,) = bootstrap.interval(_worst, *pair)
@@ -102,15 +100,16 @@ def compare(plan: Plan, arm: Series, against: Series, thresholds: Thresholds) ->
 def mean_log_ratio(plan: Plan, arm: Series, against: Series, thresholds: Thresholds) -> float:
     """Return what tuning minimises: the mean over thresholds and seeds of the log ratio of steps.
 
-    A censored training counts as one that needs twice its steps: no setting is chosen because it
-    never arrives.
+    A censored training, of either arm, counts as one that needs twice its steps: no setting is
+    chosen because it never arrives.
     """
     evaluation = plan.evaluation_of(arm.task)
     total = arm.num_timesteps[-1]
     logs = []
     for threshold in thresholds.values():
-        mine, others = (steps_to(one, threshold, evaluation)[0] for one in (arm, against))
-        logs.append(np.log(np.where(mine >= total, 2 * total, mine) / others).mean())
+        pair = (steps_to(one, threshold, evaluation)[0] for one in (arm, against))
+        mine, others = (np.where(steps >= total, 2 * total, steps) for steps in pair)
+        logs.append(np.log(mine / others).mean())
     return float(np.mean(logs))
 
 

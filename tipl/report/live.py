@@ -242,7 +242,7 @@ def ratios_figure(results: LiveResults, task: str) -> Drawing:
 
 def _draw(axes: Any, series: Series, name: str, colour: str, line: str) -> None:
     """Draw the interquartile mean over seeds, and its interval."""
-    returns = np.nan_to_num(returns_of(series), nan=0.0)
+    returns = returns_of(series)
     rows = Bootstrap(resamples=500, seed=0).interval(interquartile_mean, returns)
     value, low, high = (
         np.array([row[end] for row in rows], np.float64) for end in ("value", "low", "high")

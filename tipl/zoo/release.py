@@ -193,12 +193,14 @@ def reduced(results: Results, evaluated_as: str) -> Results:
 
 
 def thinned(log: Path) -> list[dict[str, float]]:
-    """Return at most ``LINES`` lines of a log, evenly spaced on a logarithmic scale of batches."""
+    """Return a log; of a long one ``LINES`` lines at most, evenly spaced on a logarithmic scale."""
     if not log.exists():
         return []
     lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     last = len(lines) - 1
-    chosen = np.unique(np.geomspace(1, last + 1, min(LINES, last + 1)).round().astype(int)) - 1
+    chosen = np.arange(last + 1)
+    if last >= LINES:
+        chosen = np.unique(np.geomspace(1, last + 1, LINES).round().astype(int)) - 1
     return [{k: v for k, v in lines[i].items() if k != "batches_per_s"} for i in chosen]
 
 

@@ -63,17 +63,24 @@ class Learners:
         self._critic = MLP(stack, critic, config.batch_size, config.activation)
         self._log_std = stack.value("log_std")
         self._log_std_gradient = stack.gradient("log_std")
-        parameter = torch.nn.Parameter(stack.values)
-        parameter.grad = stack.gradients
+        self._rows = [torch.nn.Parameter(row) for row in stack.values]
+        for row, gradient in zip(self._rows, stack.gradients, strict=True):
+            row.grad = gradient
         self.optimizer = torch.optim.Adam(
-            [parameter], config.learning_rate, eps=config.adam_eps, fused=True
+            self._rows, config.learning_rate, eps=config.adam_eps, fused=True
         )
 
-    def moments(self, name: str) -> Tensor:
-        """Return Adam's ``exp_avg`` or ``exp_avg_sq``, (learner, column of the stack)."""
-        (parameter,) = self.optimizer.param_groups[0]["params"]
-        state: dict[str, Tensor] = self.optimizer.state[parameter]
-        return state.get(name, torch.zeros_like(self._stack.values))
+    def adam(self, learner: int) -> dict[str, Tensor]:
+        """Return Adam's state of a learner, not a copy: ``step``, ``exp_avg`` and ``exp_avg_sq``.
+
+        The moments have a row's columns; all is 0 before the first gradient step.
+        """
+        row = self._rows[learner]
+        state: dict[str, Tensor] = self.optimizer.state[row]
+        if not state:  # as Adam begins
+            names = ("exp_avg", "exp_avg_sq")
+            state |= {"step": torch.zeros(()), **{name: torch.zeros_like(row) for name in names}}
+        return state
 
     def estimate(self, observations: Tensor) -> Tensor:
         """Return the critic's values (learner, step) for network inputs (learner, step, obs)."""

@@ -38,8 +38,6 @@ _SERIAL = 15
 another algorithm."""
 _GROUP = 2**20
 """Parameters that are updated together: 16 MB with gradients and moments, which caches hold."""
-_MOMENTS = ("exp_avg", "exp_avg_sq")
-"""Names of Adam's moments in the optimizer's state."""
 _LOG_SQRT_2PI = np.float32(0.5 * np.log(2 * np.pi))
 
 
@@ -91,8 +89,8 @@ class LearnerState:
 
     parameters: Tensor
     """Row of the stack: actor and critic."""
-    moments: dict[str, Tensor]
-    """Adam's moments of the same parameters by name; empty before the first gradient step."""
+    adam: dict[str, Tensor]
+    """Adam's state of the same parameters: ``step``, ``exp_avg`` and ``exp_avg_sq``."""
     obs_norm: Moments | None
     """Statistics of the observations; None: there is no normaliser."""
     ret_norm: Moments | None
@@ -185,30 +183,25 @@ class Population:
 
     def forget_direction(self, learner: int) -> None:
         """Set Adam's first moment of a learner's policy weights to 0."""
-        part, learners = self._group(learner)
-        learners.moments("exp_avg")[learner - part.start].numpy()[self._actor] = 0
+        self._adam(learner)["exp_avg"].numpy()[self._actor] = 0
 
     def save(self, learner: int) -> LearnerState:
-        """Return a copy of a learner's policy, critic, Adam's moments and normalisers."""
-        part, learners = self._group(learner)
+        """Return a copy of a learner's policy, critic, Adam's state and normalisers."""
         normalizer = self._environments.normalizer
         return LearnerState(
             parameters=self.stack.values[learner].clone(),
-            moments={n: learners.moments(n)[learner - part.start].clone() for n in _MOMENTS},
+            adam={name: value.clone() for name, value in self._adam(learner).items()},
             obs_norm=normalizer.obs_norm(learner),
             ret_norm=normalizer.ret_norm(learner),
         )
 
     @torch.no_grad()
     def restore(self, learner: int, state: LearnerState) -> None:
-        """Put a learner back to what ``save`` returned. Its environment goes on where it is.
-
-        The numbers of Adam's steps and of observed rewards are the same for all learners, and stay.
-        """
-        part, learners = self._group(learner)
+        """Put a learner back to what ``save`` returned. Its environment goes on where it is."""
         self.stack.values[learner] = state.parameters
-        for name, moments in state.moments.items():
-            learners.moments(name)[learner - part.start] = moments
+        adam = self._adam(learner)
+        for name, value in state.adam.items():
+            adam[name].copy_(value)
         self._environments.normalizer.restore(learner, state.obs_norm, state.ret_norm)
 
     def train(
@@ -328,15 +321,13 @@ class Population:
         return np.array(orders).swapaxes(0, 1)
 
     def _moments(self, learner: int) -> tuple[np.ndarray, np.ndarray]:
-        part, learners = self._group(learner)
-        first, second = (
-            learners.moments(name)[learner - part.start].numpy()[self._actor] for name in _MOMENTS
-        )
-        return first, second
+        adam = self._adam(learner)
+        return adam["exp_avg"].numpy()[self._actor], adam["exp_avg_sq"].numpy()[self._actor]
 
-    def _group(self, learner: int) -> tuple[slice, Learners]:
-        """Return the learners that are updated together with one of them."""
-        return next(pair for pair in self.groups if learner < pair[0].stop)
+    def _adam(self, learner: int) -> dict[str, Tensor]:
+        """Return Adam's state of a learner, see ``Learners.adam``."""
+        part, learners = next(pair for pair in self.groups if learner < pair[0].stop)
+        return learners.adam(learner - part.start)
 
 
 def origins_of(config: PPOConfig, seeds: Sequence[int]) -> list[Origin]:

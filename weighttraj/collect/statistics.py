@@ -69,7 +69,7 @@ class RewardStatistics:
 
     def __init__(self, learners: int, gamma: float) -> None:
         self.mean, self.var = np.zeros(learners), np.ones(learners)
-        self.count = _COUNT  # one for all: they step together
+        self.count = np.full(learners, _COUNT)
         self.discounted = np.zeros(learners)
         self._gamma = gamma
 
@@ -89,11 +89,11 @@ class RewardStatistics:
     def of(self, learner: int) -> Moments:
         """Return a copy of one learner's statistics."""
         mean, var = (np.array(x[learner]) for x in (self.mean, self.var))
-        return mean, var, float(self.count)
+        return mean, var, float(self.count[learner])
 
     def restore(self, learner: int, statistics: Moments) -> None:
-        """Put one learner's mean and variance back; the count is the same for all, and stays."""
-        self.mean[learner], self.var[learner], _ = statistics
+        """Put one learner's statistics back to what ``of`` returned."""
+        self.mean[learner], self.var[learner], self.count[learner] = statistics
 
 
 class Normalizer(Protocol):
