@@ -451,7 +451,7 @@ def _report(
     overwrite: bool = False,
     imports: Imports = (),
 ) -> None:
-    """Write a page about a data set or a run: returns, step sizes, spectrum, a film.
+    """Write a page about a data set or a run: returns, step sizes, spectrum, an animation.
 
     Args:
         path: Data set (path or id) or run.
@@ -459,8 +459,8 @@ def _report(
         cards: Folder of the model cards, with --all; unset: cards/models of the clone.
         out: New page, or folder with --all; replaces an earlier report; unset: report.html or
             gallery.
-        film: Add a short film of a policy at five moments of its training.
-        seed: Seed of the episodes in the film.
+        film: Add a short animation of a policy at five moments of its training.
+        seed: Seed of the episodes in the animation.
         overwrite: Replace any existing file.
     """
     import_modules(imports)

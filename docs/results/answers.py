@@ -17,9 +17,9 @@ def answers(rows: Sequence[TaskRow], weights: Board, returns: Board) -> str:
     ahead, clear, tasks = weights.wins("tipl-gate", "skill", 10)
     first, first_clear, _ = weights.wins("tipl-gate", "skill", 1)
     lines = [
-        "1. **Does something learned beat the last iteration, stretched, in return?** "
+        "1. **Does a learned forecast beat last-iteration-stretched in return?** "
         + _beaten(returns),
-        "2. **Does what helps in weight error help in return?** " + _agreement(weights),
+        "2. **Does a smaller weight error mean a higher return?** " + _agreement(weights),
         "3. **What transfers?** " + _transfer(weights),
         "4. **What reduces the error of the paper's model?** " + _paper(weights),
         f"5. **One gate for all tasks:** it beats AR(20) by phase, fitted to each task, on "

@@ -1,12 +1,12 @@
-"""Does tipl-gate forecast the training of another task than those that it learnt from?
+"""Does tipl-gate forecast the training of a task that it was not trained on?
 
-python docs/studies/across_tasks.py --out data/results/across-tasks  # collect, train, judge
+python docs/studies/across_tasks.py --out data/results/across-tasks  # collect, train, evaluate
 python docs/studies/across_tasks.py                                  # render what was measured
 
 Collects short runs of four environments, from the recipes of datasets/ (a quarter of an hour of
-CPU), trains on what the table names, and judges on test runs of each; those of HalfCheetah must
-have been collected. What stopped goes on. Writes across_tasks.json, and the table in
-across_tasks.md, beside this file.
+CPU), trains on what the table names, and evaluates on test runs of each; those of HalfCheetah must
+have been collected. The same command continues a stopped one. Writes across_tasks.json, and the
+table in across_tasks.md, beside this file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ RELEASED = {
     "InvertedPendulum": "tipl-gate-inverted-pendulum-v4",
     "HalfCheetah": "tipl-gate-half-cheetah-v4",
 }
-"""Gates of the zoo, by what they learnt from."""
+"""Released gates, by the task that they were trained on."""
 STEPS = 163_840
 """Environment steps of a short run: 80 iterations of PPO."""
 SEEDS = Seeds(train=[0, 1, 2, 3], validation=[6], test=[8, 9])
@@ -95,8 +95,10 @@ def measure(out: Path, cheetah: Path, n_batches: int, starts: int, workers: int)
     """Skill of each gate on the test runs of each data set."""
     short = collect_short(out)
     wanted = trainings(out, short, n_batches)
-    judged_on = {"InvertedPendulum": PENDULUM, "HalfCheetah": str(cheetah)}
-    judged_on |= {name.replace("-", ""): str(path) for name, path in zip(SHORT, short, strict=True)}
+    evaluated_on = {"InvertedPendulum": PENDULUM, "HalfCheetah": str(cheetah)}
+    evaluated_on |= {
+        name.replace("-", ""): str(path) for name, path in zip(SHORT, short, strict=True)
+    }
     with ExitStack() as stack:
         engine = stack.enter_context(engine_of(workers))
         progress = stack.enter_context(Progress())
@@ -110,7 +112,7 @@ def measure(out: Path, cheetah: Path, n_batches: int, starts: int, workers: int)
         models |= {name: tipl.load(model) for name, model in RELEASED.items()}
         tasks = [
             (model, data, number, starts)
-            for data in judged_on.values()
+            for data in evaluated_on.values()
             for number in range(len(wt.open(data).split("test").runs))
             for model in models.values()
         ]
@@ -130,12 +132,12 @@ def measure(out: Path, cheetah: Path, n_batches: int, starts: int, workers: int)
     skill = {
         name: {
             place: BOOTSTRAP.interval(_skill, of(model, data), of(models["copy"], data))
-            for place, data in judged_on.items()
+            for place, data in evaluated_on.items()
         }
         for name, model in models.items()
         if name != "copy"
     }
-    runs = {place: len(wt.open(data).split("test").runs) for place, data in judged_on.items()}
+    runs = {place: len(wt.open(data).split("test").runs) for place, data in evaluated_on.items()}
     return {
         "n_batches": n_batches,
         "starts": starts,
@@ -151,12 +153,12 @@ def _skill(error: np.ndarray, copy: np.ndarray) -> np.ndarray:
 
 
 def table(result: dict[str, Any]) -> str:
-    """One table a horizon; what a gate did not learn from is marked."""
+    """Return one table a horizon; tasks that a gate was not trained on are marked."""
     places = list(result["runs"])
     lines = []
     for row, h in enumerate(result["horizons"]):
         lines += [
-            f"| h = {h}: learnt from | " + " | ".join(places) + " |",
+            f"| h = {h}: trained on | " + " | ".join(places) + " |",
             "|---|" + "---:|" * len(places),
         ]
         for name, skill in result["skill"].items():
@@ -170,15 +172,15 @@ def table(result: dict[str, Any]) -> str:
             f"Skill (0 is persistence, 1 the truth) at {result['starts']} starts of each test "
             f"run: {count}. In italics: runs of tasks that the gate has not seen. The four: short "
             f"runs of {result['steps']:,} environment steps; {result['n_batches']:,} batches. The "
-            "gates of one task are those of the zoo. 95 % intervals: bootstrap over runs.",
+            "gates of one task are the released ones. 95 % intervals: bootstrap over runs.",
         ]
     )
 
 
-def _foreign(learnt_from: str, place: str) -> bool:
+def _foreign(trained_on: str, place: str) -> bool:
     if place in ("InvertedPendulum", "HalfCheetah"):
-        return place not in learnt_from.split(" and ")
-    return "the four" not in learnt_from
+        return place not in trained_on.split(" and ")
+    return "the four" not in trained_on
 
 
 def _told(cell: Cell, foreign: bool) -> str:

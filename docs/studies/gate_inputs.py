@@ -1,4 +1,4 @@
-"""What is each input of tipl-gate worth? It is trained without each, and judged on test runs.
+"""What is each input of tipl-gate worth? It is trained without each, and evaluated on test runs.
 
 python docs/studies/gate_inputs.py --models data/results/gate-inputs   # train, measure, render
 python docs/studies/gate_inputs.py                                     # render what was measured

@@ -1,13 +1,14 @@
-"""Do the commands on the cards make the models of the zoo again?
+"""Do the commands on the cards make the released models again?
 
-python docs/studies/trained_again.py --out FOLDER NAME [NAME ...]   # train, judge, render
+python docs/studies/trained_again.py --out FOLDER NAME [NAME ...]   # train, evaluate, render
 python docs/studies/trained_again.py --seeds 1 2 --beside NAME ...  # with other seeds too
 python docs/studies/trained_again.py                                # render what was measured
 
-Runs the commands of each card, judges what they made as the card's model was judged, and keeps both
-in trained_again.json. Trainings that stopped go on. HalfCheetah's runs have to be collected first,
-and another CPU makes other runs under the same seeds: with --beside, the zoo's models are judged on
-those that are here too. Writes the tables in trained_again.md, beside this file.
+Runs the commands of each card, evaluates the new models as the released ones were, and keeps both
+results in trained_again.json. The same command continues a stopped one. HalfCheetah's runs have to
+be collected first, and another CPU makes other runs under the same seeds: with --beside, the
+released models are evaluated on the runs that are here too. Writes the tables in trained_again.md,
+beside this file.
 """
 
 from __future__ import annotations
@@ -33,22 +34,22 @@ ZOO = Path(tipl.__file__).parent / "zoo/models"
 
 
 @dataclass(frozen=True)
-class Judging:
-    """How the models of one data set are judged again."""
+class Evaluation:
+    """How the models of one data set are evaluated again."""
 
     options: str
-    """As the models of the zoo were."""
+    """As for the released models."""
     figures: dict[str, tuple[Measure, int]]
     """What is read of a result file, and at which horizon."""
 
 
-JUDGED = {
-    "inverted-pendulum-v4-ppo-v1": Judging(
+EVALUATIONS = {
+    "inverted-pendulum-v4-ppo-v1": Evaluation(
         "--return-horizons 1 2 5 10 50 100 --learning-starts 4 --plateau-starts 1",
         {f"skill, h = {h}": (SKILL, h) for h in (1, 10, 50)}
         | {f"gain, h = {h}": (GAIN, h) for h in (10, 50)},
     ),
-    "half-cheetah-v4-ppo-v1": Judging(
+    "half-cheetah-v4-ppo-v1": Evaluation(
         "--starts 60 --function-starts 12 --learning-starts 0 --plateau-starts 0",
         {f"skill, h = {h}": (SKILL, h) for h in (1, 10, 50, 200)}
         | {"function skill, h = 10": (function_skill, 10)},
@@ -82,20 +83,20 @@ def run(words: list[str]) -> None:
 def measure(
     names: list[str], out: Path, beside: bool, seeds: list[int], workers: int
 ) -> dict[str, Any]:
-    """Figures of models of one data set: the zoo's, and those of what was made again."""
+    """Figures of models of one data set: the released ones, and those that were made again."""
     again = {name: make(name, out) for name in names}
     seeded = {(name, seed): make(name, out, seed) for name in names for seed in seeds}
     metrics = {name: found for name in names if (found := read_metrics(ZOO / name))}
     (data,) = {one.results.data for one in metrics.values()}
-    judging = JUDGED[data]
-    results = judge(list(again.values()), data, judging, out / f"report-{data}", workers)
+    how = EVALUATIONS[data]
+    results = evaluate(list(again.values()), data, how, out / f"report-{data}", workers)
     scores = dict(results.forecasters)
     if seeds:
         folder = out / f"report-{data}-seeds"
-        scores |= judge(list(seeded.values()), data, judging, folder, workers).forecasters
+        scores |= evaluate(list(seeded.values()), data, how, folder, workers).forecasters
     if beside:
         zoo = [ZOO / name for name in names]
-        known = judge(zoo, data, judging, out / f"report-{data}-zoo", workers).forecasters
+        known = evaluate(zoo, data, how, out / f"report-{data}-zoo", workers).forecasters
     else:
         known = {name: one.scores for name, one in metrics.items()}
     models = {
@@ -105,7 +106,7 @@ def measure(
                 "again": at(scores[again[name].name], path),
                 "seeds": [at(scores[seeded[name, seed].name], path) for seed in seeds],
             }
-            for figure, path in judging.figures.items()
+            for figure, path in how.figures.items()
         }
         for name in names
     }
@@ -114,9 +115,9 @@ def measure(
     }
 
 
-def judge(models: list[Path], data: str, judging: Judging, out: Path, workers: int) -> Results:
+def evaluate(models: list[Path], data: str, how: Evaluation, out: Path, workers: int) -> Results:
     """A result file."""
-    options = f"--data {data} --out {out} {judging.options} --workers {workers}"
+    options = f"--data {data} --out {out} {how.options} --workers {workers}"
     run(["tipl", "evaluate", *map(str, models), *shlex.split(options)])
     return read_results(out / "results.json")
 
@@ -130,14 +131,14 @@ def at(scores: Scores, figure: tuple[Measure, int]) -> Cell:
 
 
 def table(measured: dict[str, Any]) -> str:
-    """The zoo's intervals, and what came out, a table for each data set."""
+    """Return the released models' intervals and the new figures, a table for each data set."""
     return "\n\n".join(_table(data, **found) for data, found in measured.items())
 
 
 def _table(
     data: str, runs: list[str], beside: bool, seeds: list[int], models: dict[str, Any]
 ) -> str:
-    figures = JUDGED[data].figures
+    figures = EVALUATIONS[data].figures
     lines = [
         f"## {data}",
         "",
@@ -155,9 +156,12 @@ def _table(
         ]
     every = [cell for found in models.values() for cell in found.values()]
     inside = sum(_inside(cell) for cell in every)
-    known = "the interval of the zoo's model on the same runs" if beside else "the card's interval"
+    known = (
+        "the interval of the released model on the same runs" if beside else "the card's interval"
+    )
     told = (
-        f"What was trained again, judged on {len(runs)} test runs, and behind it {known}. "
+        f"Models that were trained again, on {len(runs)} test runs, and behind each figure "
+        f"{known}. "
         f"{inside} of {len(every)} figures lie in it; those that do not are bold."
     )
     return "\n".join([*lines, "", told])
@@ -168,7 +172,7 @@ def _inside(cell: dict[str, Any]) -> bool:
 
 
 def _digits(cell: dict[str, Any]) -> int:
-    """As many as show how wide the zoo's interval is."""
+    """Return as many digits as show how wide the released model's interval is."""
     return 2 if cell["zoo"]["high"] - cell["zoo"]["low"] > 0.01 else 3
 
 
@@ -187,12 +191,12 @@ STUDY = Study(__file__, table)
 def main() -> None:
     """Train and measure, if models are named, and render."""
     options = parser(__doc__)
-    options.add_argument("names", nargs="*", help="models of the zoo, judged on one data set")
+    options.add_argument("names", nargs="*", help="released models, all evaluated on one data set")
     options.add_argument("--out", type=Path, default=Path("data/results/again"))
     options.add_argument(
         "--beside",
         action="store_true",
-        help="judge the zoo's models too: the test runs here are not those of the cards",
+        help="evaluate the released models too: the test runs here are not those of the cards",
     )
     options.add_argument("--seeds", type=int, nargs="*", default=[], help="of further trainings")
     options.add_argument("--workers", type=int, default=2)

@@ -1,4 +1,4 @@
-"""Variants of tipl-gate: trained on the same runs, and judged on the same starts of others."""
+"""Variants of tipl-gate: trained on the same runs, and evaluated on the same starts of others."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def errors_of(forecaster: Forecaster, data: str | Path) -> np.ndarray:
     )
 
 
-def train_and_judge(config: GateTrainConfig, tell: Tell) -> np.ndarray:
+def train_and_evaluate(config: GateTrainConfig, tell: Tell) -> np.ndarray:
     """One variant."""
     return errors_of(train_gate(config), config.data[0])
 
@@ -60,7 +60,7 @@ def compare(variants: Mapping[str, GateTrainConfig], whole: str, workers: int) -
         progress = stack.enter_context(Progress())
         task = progress.add_task("networks", total=len(variants))
         for config, outcome in engine.run(
-            train_and_judge, list(variants.values()), lambda *_: None
+            train_and_evaluate, list(variants.values()), lambda *_: None
         ):
             if isinstance(outcome, Exception):
                 raise outcome
