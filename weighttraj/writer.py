@@ -167,6 +167,12 @@ class RunWriter:
         """Replace the description of the policy: it turned out that it acts otherwise."""
         self._store.commit(replace(self._store.info, policy=policy))
 
+    def note_move(self, by: str) -> None:
+        """Note in the metadata what changed the weights beside the gradient steps."""
+        info = self._store.info
+        if by not in info.moved_by:
+            self._store.commit(replace(info, moved_by=(*info.moved_by, by)))
+
     def flush(self, status: Status = "collecting") -> None:
         """Write and commit everything appended so far."""
         store = self._store

@@ -423,6 +423,28 @@ def test_an_interrupted_training_is_committed_when_the_callback_goes(
     assert (len(run), run.info.status) == (5, "crashed")
 
 
+@pytest.mark.parametrize("last", [True, False])
+def test_another_callback_that_fails_at_the_end_costs_no_snapshot(
+    last: bool, tmp_path: Path
+) -> None:
+    """Neither one that comes later in the list nor one that comes before."""
+
+    class Fails(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_training_end(self) -> None:
+            raise OSError("no space")
+
+    callback = WeightTrajectoryCallback(tmp_path / "run.zarr", every=4)
+    model = make_ppo(SMALL, seed=0)
+    with pytest.raises(OSError, match="no space"):
+        model.learn(256, callback=[callback, Fails()] if last else [Fails(), callback])
+    run = wt.open_run(tmp_path / "run.zarr")  # nothing has been collected as garbage
+    assert (len(run), run.info.status) == (9, "complete" if last else "crashed")
+    assert wt.verify(run.path) == []
+
+
 def test_a_callback_records_one_training(tmp_path: Path) -> None:
     callback = WeightTrajectoryCallback(tmp_path / "run.zarr")
     with pytest.raises(CollectError, match="before training"):

@@ -17,7 +17,7 @@ from msgspec.structs import replace as replace_struct
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 import tipl
 import weighttraj as wt
@@ -29,6 +29,7 @@ from tipl.growing import GrowingRun
 from tipl.live import ForecastCallback, IterationAverage, Jump, JumpConfig, PopulationJumps
 from tipl.live.config import known_every, known_horizons
 from tipl.live.guards import ReturnWatch, passes_batch
+from tipl.live.path import TrainingPath
 from tipl.live.plan import ppo_of, read_plan
 from tipl.live.results import Cpu, Curve, Series, read_live
 from tipl.live.study import LiveConfig, run_live
@@ -43,6 +44,7 @@ from weighttraj.collect.describe import describe_run
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.population import Population, origins_of
 from weighttraj.collect.settings import Store
+from weighttraj.tools.lint import lint_run
 
 # 8 gradient steps an iteration: 4 snapshots. One iteration ahead along the last one is an outer
 # step with sigma = 2.
@@ -229,6 +231,88 @@ def test_the_batch_guard_takes_dictionaries_of_observations() -> None:
     assert [jump.outcome for jump in callback.jumps] == ["refused"] * 2
 
 
+def test_the_batch_guard_takes_binary_actions() -> None:
+    class Switches(gym.Env[Any, Any]):
+        observation_space = gym.spaces.Box(-1, 1, (2,))
+        action_space = gym.spaces.MultiBinary(3)
+
+        def reset(self, **settings: Any) -> Any:
+            super().reset(**settings)
+            return self.observation_space.sample(), {}
+
+        def step(self, action: Any) -> Any:
+            done = bool(self.np_random.random() < 0.1)
+            return self.observation_space.sample(), float(sum(action)), done, False, {}
+
+    settings: Any = {"n_steps": 32, "batch_size": 8, "n_epochs": 2, "device": "cpu", "seed": 0}
+    callback = ForecastCallback(Ahead(0.01), replace(OUTER, guard="batch"))
+    PPO("MlpPolicy", Switches(), **settings).learn(96, callback=callback)
+    assert len(callback.jumps) == 2
+
+
+def test_the_rollout_guard_refuses_normalizers_in_other_processes() -> None:
+    def normalized() -> Any:
+        return gym.wrappers.NormalizeObservation(gym.make("InvertedPendulum-v4"))
+
+    env = SubprocVecEnv([normalized])
+    try:
+        callback = ForecastCallback("last-iteration", replace(OUTER, guard="rollout"))
+        with pytest.raises(ForecastError, match="NormalizeObservation in a SubprocVecEnv"):
+            PPO("MlpPolicy", VecMonitor(env), device="cpu").learn(64, callback=callback)
+    finally:
+        env.close()
+
+
+def test_an_iteration_that_adds_no_snapshot_makes_no_jump() -> None:
+    callback = ForecastCallback("tipl-gate", JumpConfig(horizon=50))
+    with pytest.raises(ForecastError, match="at least 64"):
+        learn(SMALL, callback)  # 8 gradient steps
+    info = run_info()
+    path = TrainingPath(Ahead(), OUTER, info.layout, np.zeros(info.layout.size, np.float32))
+    weights = np.zeros(info.layout.size, np.float32)
+    made = []
+    for iteration in (1, 2, 3):
+        if iteration != 2:  # as where target_kl ends an update at once
+            assert [path.end_gradient_step() for _ in range(EVERY)][-1]
+            path.append(weights, iteration, 64 * iteration, 1e-3)
+        made.append(path.propose(weights, iteration, 64 * iteration, 0.5) is not None)
+    assert made == [True, False, True]
+
+
+def test_a_callback_follows_one_model() -> None:
+    callback = ForecastCallback("last-iteration", OUTER)
+    learn(SMALL, callback)
+    with pytest.raises(ForecastError, match="another model"):
+        learn(SMALL, callback)
+
+
+def test_a_training_that_is_stopped_leaves_its_jumps(tmp_path: Path) -> None:
+    class Stop(ForecastCallback):
+        def _on_rollout_end(self) -> None:
+            super()._on_rollout_end()
+            if self._iteration == 3:
+                raise KeyboardInterrupt
+
+    recorder = WeightTrajectoryCallback(tmp_path / "run.zarr", every=EVERY)
+    with pytest.raises(KeyboardInterrupt):
+        learn(SMALL, [Stop(Ahead(), OUTER), recorder])
+    assert len(json.loads((tmp_path / "run.jumps.json").read_text())) == 2
+    run = wt.open_run(tmp_path / "run.zarr")
+    assert (run.info.status, run.info.moved_by) == ("crashed", ("Stop",))
+    assert "moved" in [finding.check for finding in lint_run(run)]
+
+
+def test_a_log_that_cannot_be_written_is_told_before_the_training(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    callback = ForecastCallback("last-iteration", OUTER, log=tmp_path / "file/jumps.json")
+    with pytest.raises(ForecastError, match="cannot be written"):
+        learn(SMALL, callback)
+    assert callback.num_timesteps == 0
+    log = tmp_path / "new/jumps.json"
+    learn(SMALL, ForecastCallback("last-iteration", OUTER, log=log))
+    assert len(json.loads(log.read_text())) == 3
+
+
 def test_a_return_falls_when_it_falls_beyond_its_noise() -> None:
     watch = ReturnWatch(JumpConfig(noise=2, episodes=4))
     assert not watch.has_fallen([-1e9])  # nothing is known before
@@ -266,9 +350,19 @@ def test_horizons_follow_the_schedule() -> None:
     some = JumpConfig(first=3, period=4, last=11)
     assert [i for i in range(1, 20) if some.is_due(i)] == [3, 7, 11]
     assert JumpConfig(fade=True, amplitude=2).amplitude_at(0.25) == 0.5
-    for wrong in ({"horizon": 0}, {"period": 0}, {"schedule": ()}, {"schedule": ((1, 0),)}):
-        with pytest.raises(ForecastError, match="expected"):
-            JumpConfig(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"horizon": 0}, {"period": 0}, {"schedule": ()}, {"schedule": ((1, 0),)}),
+        *({"guard": "bacth"}, {"moments": "rest"}, {"schedule": "faling"}, {"every": 2.5}),
+        *({"amplitude": float("nan")}, {"first": 3, "last": 2}, {"horizon": "50"}),
+    ],
+)
+def test_impossible_settings_of_jumps_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ForecastError, match="expected"):
+        JumpConfig(**wrong)
 
 
 def test_a_forecaster_that_needs_the_future_is_refused() -> None:
@@ -608,6 +702,26 @@ def test_trainings_with_another_forecaster_are_made_again(
         assert made["fingerprint"] == fingerprint(tipl.load("m"))
 
 
+def test_a_damaged_file_of_trainings_is_refused(plan: Path) -> None:
+    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning", arms=("ppo",))
+    run_live(config)
+    file = config.out / "tuning/pendulum/ppo/10-11.json"
+    good = file.read_bytes()
+    for bad in (good[:-20], good.replace(b'"seed":10', b'"seed":11')):
+        file.write_bytes(bad)
+        with pytest.raises(EvaluateError, match="damaged"):
+            run_live(config)
+    file.write_bytes(good)
+    run_live(config)
+
+
+def test_a_task_without_batched_physics_is_refused(plan: Path) -> None:
+    recipe = plan.parent / "recipe.toml"
+    recipe.write_text(SHORT.replace("[ppo]", '[ppo]\nenv_id = "Pendulum-v1"'))
+    with pytest.raises(EvaluateError, match="planar MuJoCo"):
+        run_live(LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning"))
+
+
 @pytest.mark.parametrize(
     ("names", "told"),
     [({"tasks": ("ppo",)}, "no such task"), ({"arms": ("pendulum",)}, "no such arm")],
@@ -624,6 +738,11 @@ def test_tasks_and_arms_that_the_plan_lacks_are_refused(
     [
         ('rival = "outer"', 'rival = "none"', "no arm 'none'"),
         ('"20:23"', '"20:23,22:24"', "seeds \\[22\\] stand twice"),
+        ("[arms.ppo]", "[arms.ppo]\ngrid = { amplitude = [1.0] }", "without a grid"),
+        ("[1.0, 2.0]", "[1.0, 1.0]", "no value, or one twice"),
+        ("[1.0, 2.0]", "[]", "no value, or one twice"),
+        ("[arms.far]", '[arms."../far"]', "a name has letters"),
+        ('guard = "batch" }', 'guard = "batch" }\nlearning_rate = -1.0', "learning rate"),
         ("bootstrap = 50", "bootstrap = 0", "bootstrap is at least 1"),
         ('"20:23"', '"11:23"', "for tuning and for the test"),
         ("horizon = 4", "horison = 4", "no settings"),

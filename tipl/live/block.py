@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -12,6 +13,7 @@ import msgspec
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from tipl.errors import EvaluateError
 from tipl.live.path import forecaster_of
 from tipl.live.plan import Evaluation, Trial
 from tipl.live.population import PopulationJumps
@@ -73,14 +75,35 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
     cpu: Cpu
     fingerprint: str = ""
     """SHA-256 of the forecaster's files; empty: there is none, or it was not recorded."""
+    checksum: str = ""
+    """SHA-256 of the same document with an empty checksum; empty: written by an earlier version."""
+
+    def digest(self) -> str:
+        """Return what ``checksum`` must be."""
+        document = msgspec.structs.replace(self, checksum="")
+        return hashlib.sha256(msgspec.json.encode(document)).hexdigest()
 
 
 def read_block(block: Block) -> Made | None:
-    """Return what a block's file holds; None: not there, or of other settings or forecaster."""
+    """Return what a block's file holds; None: not there, or of other settings or forecaster.
+
+    Raises:
+        EvaluateError: the file is damaged.
+    """
     try:
         made = msgspec.json.decode(block.file.read_bytes(), type=Made)
-    except (FileNotFoundError, ValueError):
+        if made.checksum and made.checksum != made.digest():
+            raise ValueError("other bytes than were written")
+    except FileNotFoundError:
         return None
+    except (ValueError, RecursionError) as error:
+        raise EvaluateError(
+            "the file of some trainings is damaged",
+            expected="what `tipl live` wrote",
+            got=error,
+            where=block.file,
+            do="restore it from a copy, or delete it: the same command then trains them again",
+        ) from error
     wanted = msgspec.json.decode(msgspec.json.encode(block.source))
     if made.fingerprint and block.fingerprint not in ("", made.fingerprint):
         return None
@@ -108,6 +131,7 @@ def make_block(block: Block, tell: Tell) -> None:
         if read_block(block) is None:
             with threads():
                 made = _Training(block, tell).run()
+            made = msgspec.structs.replace(made, checksum=made.digest())
             replace_file(block.file, msgspec.json.encode(made) + b"\n")
         block.lock.unlink(missing_ok=True)  # whoever waits for it finds the file
     finally:

@@ -17,7 +17,7 @@ from jaxtyping import Float32
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.distributions import kl_divergence
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster
@@ -49,10 +49,10 @@ class ForecastCallback(BaseCallback):
     The critic stays as it is, and so does the exploration noise ``log_std`` unless ``config`` says
     otherwise. Training is the same, bit by bit, as long as no jump is made. Beside a
     ``WeightTrajectoryCallback`` of the same training, the jumps are written to ``RUN.jumps.json``
-    when training ends. The recorded run ends with the last gradient step: if the guard ``rollout``
+    as they happen. The recorded run ends with the last gradient step: if the guard ``rollout``
     undoes the last jump after it, the trained model is not the last snapshot.
 
-    A second call of ``learn`` continues the path and the jumps of the first one.
+    A second call of ``learn`` of the same model continues the path and the jumps of the first one.
 
     Args:
         forecaster: a folder, a name or an address for ``tipl.load``, or the forecaster itself.
@@ -62,7 +62,9 @@ class ForecastCallback(BaseCallback):
 
     Raises:
         ForecastError: the forecaster needs the future of the run; or (when training starts) the
-            model is no PPO; or (when an episode ends) the guard ``rollout`` cannot see its return.
+            model is no PPO, or another one than before, an iteration has too few gradient steps, or
+            the guard ``rollout`` cannot put a normaliser back; or (when an episode ends) that guard
+            cannot see its return; or the jumps cannot be written.
         ModelError: (at the first jump) the forecaster was trained on another cadence.
     """
 
@@ -86,6 +88,7 @@ class ForecastCallback(BaseCallback):
         self._before: _Before | None = None
         self._fallen = False
         self._path: TrainingPath | None = None
+        self._followed: PPO | None = None
         self._batch: dict[str, Any] = {}
         self._hook: Any = None
         self._agent: Agent
@@ -108,10 +111,23 @@ class ForecastCallback(BaseCallback):
                 got=type(self.model).__name__,
                 do="leave the callback out",
             )
-        self._agent = find_agent(self.model)
-        if self._path is None:  # a second call of learn() goes on with the same path
+        if self._followed not in (None, self.model):
+            raise ForecastError(
+                "the callback has followed the training of another model",
+                expected="the same model in each call of learn",
+                got=f"another {type(self.model).__name__}",
+                do="make a new callback for this model",
+            )
+        self._followed, self._agent = self.model, find_agent(self.model)
+        if self._path is None:  # a second call of learn continues the same path
             layout = describe_layout(self._agent.actor, describe_agent(self._agent, ()))
             self._path = TrainingPath(self._forecaster, self.config, layout, self._weights())
+        samples = self.model.n_steps * self.model.n_envs
+        self._path.check_iteration(self.model.n_epochs * -(-samples // self.model.batch_size))
+        if self.config.guard == "rollout":
+            self._check_normalizers()
+        if self._log is not None:
+            self._write_jumps()
         if self._hook is not None:  # an exception ended the call of learn() before
             self._hook.remove()
         optimizer = cast(torch.optim.Optimizer, self._agent.optimizer)
@@ -168,6 +184,23 @@ class ForecastCallback(BaseCallback):
             if proposed is not None:
                 self._jump(now, *proposed)
 
+    def _check_normalizers(self) -> None:
+        """Refuse normalisers that the guard ``rollout`` could not put back."""
+        env = cast(VecEnv, self.model.get_env())
+        kinds = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
+        while isinstance(env, VecEnvWrapper):
+            env = env.venv
+        if isinstance(env, DummyVecEnv):
+            return
+        found = [kind.__name__ for kind in kinds if any(env.env_is_wrapped(cast(Any, kind)))]
+        if found:
+            raise ForecastError(
+                "the guard 'rollout' cannot put normalisers in other processes back",
+                expected="VecNormalize, or environments in a DummyVecEnv",
+                got=f"{', '.join(found)} in a {type(env).__name__}",
+                do="normalise with VecNormalize, or choose another guard",
+            )
+
     def _jump(
         self, now: Float32[np.ndarray, " param"], jump: Jump, after: Float32[np.ndarray, " param"]
     ) -> None:
@@ -184,6 +217,7 @@ class ForecastCallback(BaseCallback):
                 jump.outcome = "refused"
         if accepted and self.config.moments == "reset":
             self._forget_direction()
+        self._write_jumps()
 
     def _move(self, after: Float32[np.ndarray, " param"]) -> bool:
         """Set the actor's weights; set them back and return False if the guard refuses."""
@@ -204,9 +238,9 @@ class ForecastCallback(BaseCallback):
     def _judge(self) -> tuple[Any, float]:
         """Return the policy's distributions on the last rollout, and its surrogate."""
         policy = self.model.policy
-        observations, actions = (self._flat(name) for name in ("observations", "actions"))
+        observations, actions = self._flat("observations"), self._flat("actions").float()
         distribution = copy.copy(policy.get_distribution(observations))
-        if isinstance(policy.action_space, gym.spaces.Discrete):
+        if isinstance(policy.action_space, gym.spaces.Discrete):  # as PPO.train
             actions = actions.long().flatten()
         change = distribution.log_prob(actions) - self._flat("log_probs")
         clip = cast(Any, self.model.clip_range)(self.model._current_progress_remaining)
@@ -232,6 +266,7 @@ class ForecastCallback(BaseCallback):
                 vars(stats).update(copy.deepcopy(old))
             cast(TrainingPath, self._path).moved(now, self._weights())
         self._before = None
+        self._write_jumps()
 
     def _save(self, jump: Jump) -> _Before:
         policy = self.model.policy
@@ -280,7 +315,7 @@ class ForecastCallback(BaseCallback):
         """Change weights with the knowledge of those who record them."""
         with contextlib.ExitStack() as stack:
             for recorder in _recorders(self.locals.get("callback")):
-                stack.enter_context(recorder.moving())
+                stack.enter_context(recorder.moving(type(self).__name__))
             yield
 
     @torch.no_grad()
@@ -290,10 +325,24 @@ class ForecastCallback(BaseCallback):
             self._undo(self._weights(), self._before)
         self._before = None
         cast(TrainingPath, self._path).end_iteration(self._weights())
+        self._write_jumps()
+
+    def _write_jumps(self) -> None:
+        """Write all jumps so far, so that a training that is killed leaves them too."""
         paths = [_beside(recorder.path) for recorder in _recorders(self.locals.get("callback"))]
+        content = msgspec.json.encode([asdict(jump) for jump in self.jumps])
         for path in [self._log] if self._log is not None else paths:
-            content = msgspec.json.encode([asdict(jump) for jump in self.jumps])
-            replace_file(path, msgspec.json.format(content, indent=1) + b"\n")
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(path, msgspec.json.format(content, indent=1) + b"\n")
+            except OSError as error:
+                raise ForecastError(
+                    "the jumps cannot be written",
+                    expected="a file that can be written",
+                    got=error.strerror or repr(error),
+                    where=path,
+                    do="choose another path for the log",
+                ) from error
 
 
 def _recorders(callback: Any) -> list[WeightTrajectoryCallback]:

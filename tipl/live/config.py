@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
+
+import msgspec
 
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster
@@ -54,10 +57,28 @@ class JumpConfig:
     that the forecaster was trained on, or 64."""
 
     def __post_init__(self) -> None:
+        for name, kind in get_type_hints(JumpConfig).items():
+            try:
+                msgspec.convert(value := getattr(self, name), kind)
+            except msgspec.ValidationError as error:
+                raise ForecastError(
+                    "invalid settings of a jump",
+                    expected=f"{name}: {error}",
+                    got=repr(value),
+                    do=f"change {name}",
+                ) from error
         least = {"horizon": 1, "period": 1, "first": 1, "max_kl": 0, "noise": 0, "episodes": 2}
         check_settings(asdict(self), least, ForecastError)
         if self.every is not None:
             check_settings({"every": self.every}, {"every": 1}, ForecastError)
+        last = self.first if self.last is None else self.last
+        if not math.isfinite(self.amplitude) or last < self.first:
+            raise ForecastError(
+                "these settings make no jump",
+                expected="a finite amplitude, and last at least first",
+                got=f"amplitude {self.amplitude}, first {self.first}, last {self.last}",
+                do="change them",
+            )
         pairs = () if isinstance(self.schedule, str) else self.schedule
         if not isinstance(self.schedule, str) and not pairs:
             raise _no_schedule(self.schedule)

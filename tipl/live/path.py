@@ -75,9 +75,28 @@ class TrainingPath:
         self._run = GrowingRun(info)
         self._moves = _moving(layout, config)
         self._offset: Float64[np.ndarray, " param"] | None = None
-        self._step = self._step_before = 0
+        self._step = self._step_before = self._last_start = 0
         self._before = np.array(weights)
         self._append(weights, 0, 0, -1, float("nan"))
+
+    def check_iteration(self, gradient_steps: int) -> None:
+        """Refuse a training some of whose iterations would add no snapshot to the path.
+
+        Args:
+            gradient_steps: number of gradient steps of an iteration.
+
+        Raises:
+            ForecastError: an iteration has fewer of them than there are between two snapshots.
+        """
+        if gradient_steps < self._every:
+            raise ForecastError(
+                "an iteration has too few gradient steps to forecast after each",
+                expected=f"at least {self._every}, as from one snapshot of {self._forecaster.name} "
+                "to the next",
+                got=gradient_steps,
+                do="set JumpConfig(every=...) for a forecaster of any cadence, take more samples "
+                "or epochs in an iteration, or choose a forecaster of this cadence",
+            )
 
     def end_gradient_step(self) -> bool:
         """Count a gradient step; return whether a snapshot is due."""
@@ -152,10 +171,24 @@ class TrainingPath:
         self.end_iteration(after)
 
     def _displacement(self, horizon: int, remaining: float) -> Float32[np.ndarray, " param"] | None:
-        """Return how far the policy is to move; None: not at all, or the forecast is not finite."""
+        """Return how far the policy is to move.
+
+        None: not at all, the forecast is not finite, or no snapshot came since the last forecast.
+        """
         t = len(self._run) - 1
-        forecast = self._forecaster.forecast(self._run, [t], [horizon])[0, 0]
-        moved = (forecast - self._run.rows[t]) * self._moves
+        if t == self._last_start:  # an update that ended early added no snapshot
+            return None
+        self._last_start = t
+        forecast = self._forecaster.forecast(self._run, [t], [horizon])
+        if np.shape(forecast) != (1, 1, self._run.layout.size):
+            raise ForecastError(
+                "a forecast has another shape than asked for",
+                expected=f"(start, horizon, param) = (1, 1, {self._run.layout.size})",
+                got=np.shape(forecast),
+                where=self._forecaster.name,
+                do="correct the forecaster: see tipl.Forecaster.forecast",
+            )
+        moved = (forecast[0, 0] - self._run.rows[t]) * self._moves
         moved *= np.float32(self._config.amplitude_at(remaining))
         return moved if np.isfinite(moved).all() and moved.any() else None
 

@@ -7,6 +7,7 @@ on the tuning seeds, and the best one runs on the test seeds.
 from __future__ import annotations
 
 import itertools
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
@@ -17,10 +18,11 @@ import msgspec
 
 from tipl.errors import EvaluateError
 from tipl.live.config import JumpConfig
+from weighttraj.collect.population import check_config
 from weighttraj.collect.ppo import PPOConfig
 from weighttraj.collect.recipe import read_recipe
 from weighttraj.collect.settings import parse_seeds
-from weighttraj.errors import WeightTrajError
+from weighttraj.errors import CollectError, WeightTrajError
 
 Stage = Literal["tuning", "test"]
 
@@ -164,6 +166,25 @@ def ppo_of(plan: Plan, task: str, folder: Path) -> tuple[PPOConfig, int]:
     return replace(recipe.ppo, total_timesteps=steps), recipe.store.every
 
 
+def check_task(plan: Plan, task: str, folder: Path) -> None:
+    """Check that the trainings of a task can be done by populations, as those of a study are.
+
+    Raises:
+        EvaluateError: they cannot.
+    """
+    config, _ = ppo_of(plan, task, folder)
+    try:
+        check_config(config)
+    except CollectError as error:
+        raise EvaluateError(
+            "a study trains populations, which cannot do what the recipe asks for",
+            expected="a planar MuJoCo task and settings that the population collector takes",
+            got=str(error),
+            where=folder / plan.tasks[task].recipe,
+            do="change the recipe, or compare trainings with ForecastCallback in a script",
+        ) from error
+
+
 def _check(plan: Plan) -> None:
     """Raise ValueError if something in a plan does not fit together."""
     for name in filter(None, (plan.baseline, plan.rival)):
@@ -173,13 +194,33 @@ def _check(plan: Plan) -> None:
         raise ValueError("thresholds are shares above 0, and bootstrap is at least 1")
     _check_seeds(plan.seeds_of("tuning"), plan.seeds_of("test"))
     for name, arm in plan.arms.items():
+        _check_arm(plan, name, arm)
         if missing := {*arm.tasks} - {*plan.tasks}:
             raise ValueError(f"arm {name!r}: no tasks {sorted(missing)}")
     for task in plan.tasks:
+        _check_name("task", task)
         evaluation = plan.evaluation_of(task)
         if min(evaluation.every, evaluation.episodes, evaluation.smooth, plan.population) < 1:
             raise ValueError("every, episodes, smooth and population are at least 1")
         plan.trials(task)
+
+
+def _check_arm(plan: Plan, name: str, arm: Arm) -> None:
+    _check_name("arm", name)
+    for key, values in arm.grid.items():
+        told = [str(value) for value in values]
+        if not values or len({*told}) < len(told):
+            raise ValueError(f"arm {name!r}: the grid's {key} has no value, or one twice")
+    rates = [arm.learning_rate, *arm.grid.get("learning_rate", [])]
+    if not all(isinstance(rate, int | float) and rate > 0 for rate in rates):
+        raise ValueError(f"arm {name!r}: a factor of the learning rate is not above 0")
+    if name == plan.baseline and (arm.grid or {*plan.tasks} - {*(arm.tasks or plan.tasks)}):
+        raise ValueError(f"arm {name!r} is the baseline: it runs on all tasks, without a grid")
+
+
+def _check_name(what: str, name: str) -> None:
+    if re.fullmatch(r"\w[\w.-]*", name) is None:  # it names a folder
+        raise ValueError(f"{what} {name!r}: a name has letters, digits, '_', '-' and '.' only")
 
 
 def _check_seeds(tuning: Sequence[int], test: Sequence[int]) -> None:

@@ -90,6 +90,8 @@ class _Learner:
         every = info.cadence.every if info.cadence else EVERY
         weights = population.weights(learner)
         self.path = TrainingPath(forecaster, config, info.layout, weights, every=every)
+        if info.cadence and (steps := info.cadence.gradient_steps_per_iteration):
+            self.path.check_iteration(steps)
 
     def end_rollout(self, returns: Sequence[Any], inputs: np.ndarray) -> None:
         """See ``Recorder``."""

@@ -18,7 +18,7 @@ from tipl.errors import EvaluateError
 from tipl.evaluation.results import write_document
 from tipl.live.block import Block, Made, make_block, read_block, wait_for
 from tipl.live.path import forecaster_of
-from tipl.live.plan import Plan, Stage, Trial, ppo_of, read_plan, settings_of
+from tipl.live.plan import Plan, Stage, Trial, check_task, ppo_of, read_plan, settings_of
 from tipl.live.results import Cpu, Figure, LiveResults, Series
 from tipl.live.summary import compare, final, mean_log_ratio, thresholds_of
 from tipl.saved import fingerprint
@@ -69,6 +69,8 @@ def run_live(
     """
     plan = read_plan(config.plan)
     _check_names(plan, config)
+    for task in config.tasks or plan.tasks:
+        check_task(plan, task, config.plan.parent)
     tuned = None
     if config.stage == "test":
         whole = replace(config, stage="tuning", tasks=(), arms=())
@@ -159,7 +161,11 @@ def _marked(blocks: Iterable[Block]) -> Iterator[Block]:
     for block in blocks:
         name = block.trial.forecaster
         if name not in marks:
-            marks[name] = fingerprint(forecaster_of(name))
+            try:
+                marks[name] = fingerprint(forecaster_of(name))
+            except Exception as error:
+                error.add_note(f"arm {block.trial.arm!r}, task {block.task!r}")
+                raise
         yield msgspec.structs.replace(block, fingerprint=marks[name])
 
 

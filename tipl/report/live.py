@@ -82,8 +82,8 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
     parts = []
     for task in wanted:
         parts.append(f"![Learning curves of {task}]({folder}/{task}.svg)")
-        parts.append(f"![Ratios of environment steps, {task}]({folder}/{task}-ratios.svg)")
         if rows_of(results, task, results.baseline):
+            parts.append(f"![Ratios of environment steps, {task}]({folder}/{task}-ratios.svg)")
             parts.append(_short(results, task))
     if section == "overview" and (told := not_run(results)):
         parts.append(told)
@@ -141,7 +141,9 @@ def write_figures(results: LiveResults, folder: Path) -> None:
     """Draw the learning curves of each task into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for task in results.thresholds:
-        found = {"": curves_figure(results, task), "-ratios": ratios_figure(results, task)}
+        found = {"": curves_figure(results, task)}
+        if rows_of(results, task, results.baseline):
+            found["-ratios"] = ratios_figure(results, task)
         if task in results.primary:
             few = (results.baseline, results.rival, results.primary[task])
             found["-primary"] = curves_figure(results, task, few)

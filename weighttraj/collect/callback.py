@@ -146,14 +146,18 @@ class WeightTrajectoryCallback(BaseCallback):
             self._recorder.close(status)
 
     @contextlib.contextmanager
-    def moving(self) -> Iterator[None]:
+    def moving(self, by: str) -> Iterator[None]:
         """Let another callback change the weights, between an update and the next rollout.
 
         The next snapshot shows the changed weights, with the gradient steps that came after.
+
+        Args:
+            by: name of the other callback; the run's metadata will have it in ``moved_by``.
         """
         if self._recorder is None:  # this callback's turn comes after the other's
             yield
             return
+        self.writer.note_move(by)
         self._end_update()
         try:
             yield
@@ -232,7 +236,7 @@ class WeightTrajectoryCallback(BaseCallback):
 
     def _hold_on(self) -> None:
         """Follow the optimizer's steps, and notice when an exception ends the training."""
-        self._undo = [Guard(self.model, self.close).remove]
+        self._undo = [Guard(self.model, self.close, self.locals.get("callback")).remove]
         optimizer = self._agent.optimizer
         if optimizer is not None:
             self._undo += [

@@ -6,9 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 
 _METHODS = ("collect_rollouts", "train", "dump_logs", "_do_one_update")
 """What ``learn`` calls again and again, in one algorithm or another."""
+_LAST = "on_training_end"
+"""What it calls last of its callback."""
 _EXCLUDED = "_excluded_save_params"
 
 
@@ -22,14 +25,22 @@ class Guard:
     Args:
         model: whose training.
         on_exception: what to do. An error that it raises is noted on the exception.
+        callback: all that ``learn`` calls back, whose end of the training is watched too.
     """
 
-    def __init__(self, model: BaseAlgorithm, on_exception: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        on_exception: Callable[[], None],
+        callback: BaseCallback | None = None,
+    ) -> None:
         self._wrappers: list[_Wrapper] = []
         names = [name for name in _METHODS if hasattr(model, name)]
         for name in names:
             self._wrappers.append(_Guarded(model, name, on_exception))
         self._wrappers.append(_Exclusion(model, [*names, _EXCLUDED]))
+        if callback is not None:
+            self._wrappers.append(_Guarded(callback, _LAST, on_exception))
 
     def remove(self) -> None:
         """Give the model its own methods back. A second call does nothing."""
@@ -38,33 +49,33 @@ class Guard:
 
 
 class _Wrapper:
-    """Stands in a method's place on one model; copies and pickles give the method itself."""
+    """Stands in a method's place on one object; copies and pickles give the method itself."""
 
-    def __init__(self, model: BaseAlgorithm, name: str) -> None:
-        self._model, self._name = model, name
-        self._method = getattr(model, name)
-        self._before = vars(model).get(name)
+    def __init__(self, owner: Any, name: str) -> None:
+        self._owner, self._name = owner, name
+        self._method = getattr(owner, name)
+        self._before = vars(owner).get(name)
         self._active = True
-        vars(model)[name] = self
+        vars(owner)[name] = self
 
     def remove(self) -> None:
         """Put back what was there before; another's wrapper that came later stays."""
         self._active = False
-        current = vars(self._model).get(self._name)
+        current = vars(self._owner).get(self._name)
         while isinstance(current, _Wrapper) and not current._active:
             current = current._before
         if current is None:
-            vars(self._model).pop(self._name, None)
+            vars(self._owner).pop(self._name, None)
         else:
-            vars(self._model)[self._name] = current
+            vars(self._owner)[self._name] = current
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return getattr, (self._model, self._name)  # of the copy, which has no wrapper yet
+        return getattr, (self._owner, self._name)  # of the copy, which has no wrapper yet
 
 
 class _Guarded(_Wrapper):
-    def __init__(self, model: BaseAlgorithm, name: str, on_exception: Callable[[], None]) -> None:
-        super().__init__(model, name)
+    def __init__(self, owner: Any, name: str, on_exception: Callable[[], None]) -> None:
+        super().__init__(owner, name)
         self._on_exception = on_exception
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:

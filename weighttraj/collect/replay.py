@@ -72,6 +72,14 @@ def replay(path: str | Path, n: int, *, seed: int | None = None) -> list[str]:
             do="verify the data sets that it was made of",
         ) from error
     recipe.check(where=path)
+    if runs[0].info.moved_by:
+        raise CollectError(
+            "the training cannot be done again: more than gradient steps changed its weights",
+            expected="a run that was trained by its recipe alone",
+            got=f"weights changed by {', '.join(runs[0].info.moved_by)}",
+            where=runs[0].path,
+            do="choose another run",
+        )
     if recipe.collect.collector == "population":
         check_config(recipe.ppo)
     try:

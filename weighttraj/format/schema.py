@@ -256,6 +256,9 @@ class RunInfo:
     continues: Continuation | None = None
     """Training that the run goes on from; None: it begins with an untrained policy, or a version
     before this key was written."""
+    moved_by: tuple[str, ...] = ()
+    """What changed the weights between an update and the next rollout, such as ForecastCallback;
+    empty: nothing did, or a version before this key was written."""
     obs_norm: ObsNorm | None = None
     """Observation normaliser; None: the run has none."""
     ret_norm: bool = False

@@ -81,6 +81,9 @@ def _start(run: Run) -> Iterator[tuple[str, str]]:
             f"starts from a trained model: num_timesteps {origin.num_timesteps} at the start; "
             "which run it continues is not recorded",
         )
+    if run.info.moved_by:
+        movers = ", ".join(run.info.moved_by)
+        yield "moved", f"{movers} changed the weights between updates and rollouts"
     if origin is None and steps > 0:
         yield "start", f"begins at num_timesteps {steps}: what was before is not stored"
 
