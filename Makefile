@@ -72,6 +72,7 @@ bench: setup ## measure on two real runs (an hour to collect them), keep the num
 	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_population.py --processes --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_tipl_train.py --save
+	$(BIN)/python -W ignore tests/benchmarks/bench_gate.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_learning.py --save
 	$(BIN)/python -W ignore tests/benchmarks/bench_recipes.py --save
 	$(BIN)/python tests/benchmarks/results.py

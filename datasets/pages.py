@@ -393,10 +393,10 @@ weighttraj returns {data}{_options(facts.evaluated)} --workers 2
 ```
 
 This makes all runs of the recipe in `{data}`{", beside what is here" if facts.here else ""}.
-The same command continues a stopped one, and `--seeds 0:2` makes only the runs of seeds 0 and 1. With the same
-versions and on the same kind of processor the runs come out bit by bit: `weighttraj verify
-{recipe.id if facts.here else data} --replay {1 + iterations}` trains the first 20 iterations
-of a run again and compares them."""
+The same command continues a stopped one, and `--seeds 0:2` makes only the runs of seeds 0 and 1.
+With the same versions and on the same kind of processor the runs come out bit by bit:
+`weighttraj verify {recipe.id if facts.here else data} --replay {1 + iterations}` trains the
+first 20 iterations of a run again and compares them."""
     if facts.cost is None:
         return text
     total, each = len(recipe.splits()), facts.cost.cpu_hours_per_run

@@ -157,6 +157,7 @@ ROWS: dict[str, dict[str, Made]] = {
         "TD3": algorithm("TD3", **OFF_POLICY),
         "DDPG": algorithm("DDPG", **OFF_POLICY),
         "TQC": algorithm("TQC", **OFF_POLICY),
+        "CrossQ": algorithm("CrossQ", **OFF_POLICY),
         "DQN": algorithm("DQN", "CartPole-v1", **OFF_POLICY),
         "QRDQN": algorithm("QRDQN", "CartPole-v1", **OFF_POLICY),
         f"ARS, {BY_UPDATE}": algorithm("ARS", "CartPole-v1", n_delta=1, n_eval_episodes=1),

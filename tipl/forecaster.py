@@ -102,6 +102,7 @@ def check_request(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> N
             expected=f"starts from 0 to {len(run) - 1}, horizons from 1",
             got=f"starts {list(starts)}, horizons {list(horizons)}",
             where=run.path,
+            do="choose starts among the snapshots of the run",
         )
 
 

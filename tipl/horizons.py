@@ -13,7 +13,12 @@ HORIZONS = (*range(1, 11), 20, 50, 100, 200)
 def fitted(horizons: Sequence[int]) -> tuple[int, ...]:
     """Return the horizons to fit, rising, each once; refuse an empty list, and those below 1."""
     if not len(horizons) or min(horizons) < 1:
-        raise TrainError("there is nothing to fit", expected="horizons from 1", got=list(horizons))
+        raise TrainError(
+            "there is nothing to fit",
+            expected="horizons from 1",
+            got=list(horizons),
+            do="name at least one horizon",
+        )
     return tuple(sorted(set(horizons)))
 
 

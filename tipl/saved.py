@@ -21,13 +21,13 @@ import msgspec
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 from safetensors.torch import load_file as load_tensors
-from safetensors.torch import save_file as save_tensors
 from torch import Tensor, nn
 
 from tipl.errors import ModelError
 from tipl.forecaster import Forecaster
+from weighttraj.atomic import replace_file
 
 CONFIG = "config.json"
 ARRAYS = "model.safetensors"
@@ -77,8 +77,7 @@ class SavedNetwork(Forecaster, Generic[N, C]):
 
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""
-        write(path, self.document())
-        save_tensors(self.network.state_dict(), Path(path) / ARRAYS)
+        write(path, self.document(), arrays_of(self.network))
 
     @classmethod
     def load(cls: type[S], path: str | Path) -> S:
@@ -105,12 +104,20 @@ class SavedSettings(Forecaster):
 def write(
     path: str | Path, config: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Write a forecaster into a folder: its config, with its ``kind``, and its arrays, if any."""
+    """Write a forecaster into a folder: its arrays, if any, then its config, with its ``kind``.
+
+    Each file is replaced at once: if the process is killed, the old one is still there, whole.
+    """
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
     if arrays is not None:
-        save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, path / ARRAYS)
-    (path / CONFIG).write_text(json.dumps(config, indent=1), encoding="utf-8")
+        replace_file(path / ARRAYS, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
+    replace_file(path / CONFIG, json.dumps(config, indent=1).encode())
+
+
+def arrays_of(network: nn.Module) -> dict[str, np.ndarray]:
+    """Return the parameters and buffers of a network by name."""
+    return {name: tensor.numpy(force=True) for name, tensor in network.state_dict().items()}
 
 
 def read_config(path: str | Path, kind: str, wanted: type[T]) -> T:

@@ -40,6 +40,12 @@ Scheduler = Annotated[
     ),
 ]
 
+# What an argument is called in the help.
+DataOrRun = Annotated[Positional[str], tyro.conf.arg(metavar="DATA_OR_RUN")]
+Data = Annotated[Positional[str], tyro.conf.arg(metavar="DATASET")]
+OneRun = Annotated[Positional[str], tyro.conf.arg(metavar="RUN")]
+Address = Annotated[Positional[str], tyro.conf.arg(metavar="ADDRESS")]
+
 app = tyro.extras.SubcommandApp()
 console = Output()
 errors = Output(stderr=True)
@@ -47,7 +53,7 @@ errors = Output(stderr=True)
 
 @app.command(name="collect")
 def _collect(
-    recipe: Positional[Path],
+    recipe: Annotated[Positional[Path], tyro.conf.arg(metavar="RECIPE")],
     out: Path | None = None,
     seeds: str | None = None,
     workers: int = 1,
@@ -83,7 +89,7 @@ def _collect(
 
 @app.command(name="returns")
 def _returns(
-    path: Positional[str],
+    path: DataOrRun,
     episodes: int = 10,
     every: int = 10,
     first: int = 0,
@@ -145,7 +151,7 @@ def _last_return(run: wt.Run) -> str:
 
 
 @app.command(name="show")
-def _show(path: Positional[str]) -> None:
+def _show(path: DataOrRun) -> None:
     """Print what a data set or a run holds.
 
     Args:
@@ -184,7 +190,7 @@ def _list() -> None:
 
 @app.command(name="search")
 def _search(
-    query: Positional[str],
+    query: Annotated[Positional[str], tyro.conf.arg(metavar="CONDITION")],
     columns: tuple[str, ...] = ("dataset", "run_id", "split", "seed", "final_return"),
 ) -> None:
     """Find runs in all local data sets by environment, return and hyper-parameters.
@@ -220,7 +226,7 @@ def _text(value: object) -> str:
 
 @app.command(name="create")
 def _create(
-    out: Positional[Path],
+    out: Annotated[Positional[Path], tyro.conf.arg(metavar="FOLDER")],
     runs: Annotated[Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN ...]")],
     split: tuple[str, ...] = (),
     version: str = "1",
@@ -264,7 +270,7 @@ def _combine(
 
 
 @app.command(name="select")
-def _select(path: Positional[str], seeds: str, out: Path) -> None:
+def _select(path: Data, seeds: str, out: Path) -> None:
     """Make a data set from some runs of another one; it records which part of it.
 
     Args:
@@ -279,7 +285,7 @@ def _select(path: Positional[str], seeds: str, out: Path) -> None:
 
 @app.command(name="split")
 def _split(
-    path: Positional[str],
+    path: Data,
     out: Path,
     fractions: tuple[float, float, float] = (0.6, 0.2, 0.2),
     seed: int = 0,
@@ -297,7 +303,7 @@ def _split(
 
 @app.command(name="download")
 def _download(
-    address: Positional[str],
+    address: Address,
     out: Path | None = None,
     runs: tuple[str, ...] | None = None,
     steps: tuple[int, int] | None = None,
@@ -322,7 +328,7 @@ def _download(
 
 
 @app.command(name="card")
-def _card(path: Positional[str]) -> None:
+def _card(path: Data) -> None:
     """Write the card and croissant.json of a data set; prose in an existing card stays.
 
     Args:
@@ -333,8 +339,8 @@ def _card(path: Positional[str]) -> None:
 
 @app.command(name="upload")
 def _upload(
-    path: Positional[str],
-    address: Positional[str],
+    path: Data,
+    address: Address,
     despite_lint: bool = False,
     private: bool = False,
 ) -> None:
@@ -353,7 +359,7 @@ def _upload(
 
 
 @app.command(name="delete")
-def _delete(name: Positional[str], yes: bool = False) -> None:
+def _delete(name: Data, yes: bool = False) -> None:
     """Remove a data set from this machine; this cannot be undone.
 
     Args:
@@ -376,7 +382,7 @@ def _sure(question: str) -> bool:
 
 @app.command(name="verify")
 def _verify(
-    path: Positional[str],
+    path: DataOrRun,
     deep: bool = False,
     replay: int = 0,
     seed: int | None = None,
@@ -399,7 +405,7 @@ def _verify(
 
 
 @app.command(name="lint")
-def _lint(path: Positional[str]) -> None:
+def _lint(path: DataOrRun) -> None:
     """Look for suspicious data: duplicates, gaps, jumps; exit with 1 if there are any.
 
     Args:
@@ -411,7 +417,7 @@ def _lint(path: Positional[str]) -> None:
 
 
 @app.command(name="repair")
-def _repair(path: Positional[str], cut: bool = False) -> None:
+def _repair(path: DataOrRun, cut: bool = False) -> None:
     """Repair what can be repaired without training, and print what is left to do.
 
     Args:
@@ -426,7 +432,7 @@ def _repair(path: Positional[str], cut: bool = False) -> None:
 
 @app.command(name="pack")
 def _pack(
-    path: Positional[str],
+    path: OneRun,
     profile: Literal["default", "archive"] = "default",
     out: Path | None = None,
 ) -> None:
@@ -442,7 +448,7 @@ def _pack(
 
 @app.command(name="report")
 def _report(
-    path: Positional[str | None] = None,
+    path: Annotated[Positional[str | None], tyro.conf.arg(metavar="[DATA_OR_RUN]")] = None,
     all: bool = False,
     cards: Path | None = None,
     out: Path | None = None,
@@ -488,7 +494,7 @@ def _gallery(cards: Path | None, out: Path, film: bool) -> None:
 
 @app.command(name="export")
 def _export(
-    path: Positional[str],
+    path: DataOrRun,
     to: Literal["hdf5", "npy", "safetensors", "sb3"],
     out: Path,
     t: int = -1,
@@ -515,7 +521,7 @@ def _export(
 
 
 @app.command(name="import")
-def _import(file: Positional[str], out: Path) -> None:
+def _import(file: Annotated[Positional[str], tyro.conf.arg(metavar="FILE")], out: Path) -> None:
     """Make a data set from an HDF5 file of `export`; every checksum is verified.
 
     Args:
@@ -572,7 +578,8 @@ def main() -> None:
                 return
             app.cli(
                 prog="weighttraj",
-                description="Record, store and load the weights of policies in training.",
+                description="Record, store and load the weights of policies in training. Each "
+                "command explains its options with --help. --version prints the version.",
             )
     except (WeightTrajError, OSError) as error:
         errors.print(f"[red]error:[/red] {escape(str(error))}")

@@ -434,7 +434,13 @@ def _rows(key: Any, n: int, where: str) -> Any:
     if isinstance(key, slice):
         start, stop, step = key.indices(n)
         if step < 1:
-            raise RowError("slices go forward only", got=f"step {step}", where=where)
+            raise RowError(
+                "slices go forward only",
+                expected="a step of at least 1",
+                got=f"step {step}",
+                where=where,
+                do="read forward, and turn the array round",
+            )
         return slice(start, max(start, stop), step)
     index = np.asarray(key)
     if index.dtype == bool and index.shape == (n,):
@@ -449,6 +455,7 @@ def _rows(key: Any, n: int, where: str) -> Any:
             "mask of them all",
             got=repr(key),
             where=where,
+            do="choose committed rows",
         )
     index = np.where(index < 0, index + n, index)
     return int(index) if index.ndim == 0 else index

@@ -126,7 +126,8 @@ def _unbroken(match: re.Match[str]) -> str:
 
 def check(
     model: Annotated[
-        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, a released model, or a baseline")
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="MODEL", help="a folder, a released model, or a baseline"),
     ],
     data: Annotated[str, tyro.conf.arg(help="a data set; its first test run is used")],
     out: Annotated[Path, tyro.conf.arg(help="a JSON file")],
@@ -169,7 +170,9 @@ def check(
 
 
 def report(
-    results: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="a results.json")],
+    results: Annotated[
+        tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULTS", help="a results.json")
+    ],
     into: Annotated[
         Path | None, tyro.conf.arg(help="rewrite the sections of these results in a Markdown page")
     ] = None,

@@ -25,7 +25,10 @@ NARROW = (1, 4, 5)
 def leaderboard(
     results: Annotated[
         tyro.conf.Positional[tuple[Path, ...]],
-        tyro.conf.arg(help="folders of `tipl evaluate`, searched for rows.csv, or CSV files"),
+        tyro.conf.arg(
+            metavar="[RESULTS ...]",
+            help="folders of `tipl evaluate`, searched for rows.csv, or CSV files",
+        ),
     ],
     out: Annotated[Path, tyro.conf.arg(help="folder of leaderboard.html, .md and .csv")],
     rival: Annotated[str, tyro.conf.arg(help="forecaster that wins are counted against")] = (

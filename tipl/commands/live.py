@@ -6,6 +6,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.markup import escape
@@ -27,7 +28,7 @@ class LiveCommand(LiveConfig):
     Example: tipl live plan.toml --out data/study --stage tuning
     """
 
-    plan: tyro.conf.Positional[Path]
+    plan: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PLAN")]
     """The plan, a TOML file: see docs/jump-ahead.md."""
 
 

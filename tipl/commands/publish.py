@@ -16,7 +16,10 @@ from weighttraj.terminal import say
 
 
 def release(
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="folder of a trained model")],
+    folder: Annotated[
+        tyro.conf.Positional[Path],
+        tyro.conf.arg(metavar="FOLDER", help="folder of a trained model"),
+    ],
     name: Annotated[str, tyro.conf.arg(help="name of the released model")],
     results: Annotated[
         Path | None, tyro.conf.arg(help="results.json of the evaluation of the released model")
@@ -37,7 +40,9 @@ def release(
 
 
 def card(
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(help="a released model")],
+    name: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL", help="a released model")
+    ],
     out: Annotated[Path, tyro.conf.arg(help="folder of the cards")] = Path("cards/models"),
 ) -> None:
     """Write the card of a model; in an existing card, replace only the figures."""
@@ -46,10 +51,12 @@ def card(
 
 def push(
     model: Annotated[
-        tyro.conf.Positional[str], tyro.conf.arg(help="a folder, or a released model")
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="MODEL", help="a folder, or a released model"),
     ],
     address: Annotated[
-        tyro.conf.Positional[str], tyro.conf.arg(help="hf://organisation/name, or s3://bucket/name")
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="ADDRESS", help="hf://organisation/name, or s3://bucket/name"),
     ],
     private: Annotated[
         bool, tyro.conf.arg(help="make a new repository on the hub private")

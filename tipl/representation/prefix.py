@@ -149,6 +149,7 @@ class PrefixBases:
                 expected=f"a snapshot from 0 to {last}",
                 got=t,
                 where=where,
+                do="choose another start",
             )
         if t < self.rank:
             raise RepresentationError(

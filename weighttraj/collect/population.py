@@ -356,6 +356,7 @@ def check_config(config: PPOConfig) -> None:
             "a population cannot train with these settings",
             expected="; ".join(f"{problem.key} {problem.expected}" for problem in wrong),
             got="; ".join(f"{problem.key} = {problem.got}" for problem in wrong),
+            do='change these settings, or collect with collector = "sb3"',
         )
     env = environments.make(config.env_id)
     check_kernel(env, config.env_id)

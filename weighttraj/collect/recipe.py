@@ -85,7 +85,9 @@ def read_recipe(path: str | Path) -> Recipe:
         text = path.read_text(encoding="utf-8")
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RecipeError("the recipe is no TOML", got=error, where=path) from error
+        raise RecipeError(
+            "the recipe is no TOML", got=error, where=path, do="correct the file"
+        ) from error
     _check_keys(document, Recipe, path, text)
     ppo = document.get("ppo")
     if isinstance(ppo, dict) and ppo.get("clip_range_vf") is False:
@@ -105,6 +107,7 @@ def _convert(document: dict[str, Any], where: Callable[[str], object]) -> Recipe
             "the recipe has a value of the wrong type",
             got=error,
             where=where(key[1] if key else ""),
+            do="correct this value",
         ) from error
 
 

@@ -72,6 +72,7 @@ def collect(
             "there is nothing to collect",
             expected="seeds, in the recipe's [seeds] or from --seeds",
             where=f"recipe {recipe.id!r}",
+            do="name seeds in one of them",
         )
     out = new_path(out).absolute()
     console = console or Console(quiet=True)

@@ -86,7 +86,9 @@ def parse_seeds(seeds: list[int] | str) -> list[int]:
     try:
         return read_seeds(seeds)
     except ValueError as error:
-        raise RecipeError("invalid seeds", expected=error, got=reprlib.repr(seeds)) from error
+        raise RecipeError(
+            "invalid seeds", expected=error, got=reprlib.repr(seeds), do="correct the seeds"
+        ) from error
 
 
 def read_seeds(seeds: list[int] | str) -> list[int]:

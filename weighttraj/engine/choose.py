@@ -31,7 +31,12 @@ def engine_of(
         MissingExtraError: Dask is not installed.
     """
     if workers < 1:
-        raise EngineError("nobody to do the work", expected="workers at least 1", got=workers)
+        raise EngineError(
+            "nobody to do the work",
+            expected="workers at least 1",
+            got=workers,
+            do="ask for at least one",
+        )
     import_modules(imports)
     if scheduler is not None:
         from weighttraj.engine.cluster import Cluster

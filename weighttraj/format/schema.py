@@ -357,7 +357,12 @@ class DatasetInfo:
         check_id(self.id, "data set id")
         ids = [run.id for run in self.runs]
         if len(set(ids)) != len(ids):
-            raise FormatError("run ids in a data set must be unique", got=ids, where=self.id)
+            raise FormatError(
+                "run ids in a data set must be unique",
+                got=ids,
+                where=self.id,
+                do="give each run an id of its own",
+            )
 
     @property
     def part(self) -> str:

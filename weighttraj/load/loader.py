@@ -165,6 +165,7 @@ class _Plan(Sampler[list[int]]):
                 "no loader can be made of this",
                 expected="batch_size at least 1, seed at least 0",
                 got=f"batch_size {batch_size}, seed {seed}",
+                do="change them",
             )
         self.n, self.batch_size, self.seed = n, batch_size, seed
         self.shuffle, self.drop_last = shuffle, drop_last

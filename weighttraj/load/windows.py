@@ -282,6 +282,7 @@ def _check(runs: Sequence[Run], window: int, stride: int) -> None:
             "no windows can be made of this",
             expected="at least one run, window and stride at least 1",
             got=f"{len(runs)} runs, window {window}, stride {stride}",
+            do="choose runs and sizes that give windows",
         )
     for run in runs:
         if run.layout != runs[0].layout:

@@ -85,6 +85,7 @@ class ReturnsConfig:
                 expected="episodes and every at least 1, first, learning and seed at least 0, "
                 "one or two different modes",
                 got=self,
+                do="change these settings",
             )
 
     def rows(self, snapshots: int) -> list[int]:

@@ -105,7 +105,11 @@ class LiveStore(RunStore):
             FormatError: it is no run of this format, or it is packed.
         """
         if path.name.endswith(PACKED):
-            raise FormatError("a packed run is finished; nothing can be added", where=path)
+            raise FormatError(
+                "a packed run is finished; nothing can be added",
+                where=path,
+                do="write another run",
+            )
         objects = FolderObjects(Path(path))
         store = cls(objects, read_metadata(objects))
         for draft in objects.path.rglob(f".*{DRAFT}"):  # of a killed writer

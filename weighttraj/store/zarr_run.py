@@ -188,7 +188,12 @@ def read_metadata(objects: Objects) -> Metadata:
     documents, tags = _array_documents(document, where), attributes.get(TAGS)
     for name, spec in arrays_of(info).items():
         if name not in documents:
-            raise FormatError("the run lacks an array", expected=name, where=where)
+            raise FormatError(
+                "the run lacks an array",
+                expected=name,
+                where=where,
+                do="restore the run from a copy",
+            )
         check_array(spec, documents[name], info.committed(spec.axis), f"{objects.path}, {name}")
         expected = 8 * chunk_count(documents[name])
         tag = tags.get(name) if isinstance(tags, dict) else None

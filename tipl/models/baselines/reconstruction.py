@@ -98,4 +98,5 @@ def check_known(run: Run, starts: Sequence[int], horizons: Sequence[int]) -> Non
             expected=f"start and horizon of at most {len(run) - 1} together",
             got=max(starts) + max(horizons),
             where=run.path,
+            do="choose earlier starts or shorter horizons",
         )

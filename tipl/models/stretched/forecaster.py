@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
-from safetensors.torch import save_file
 
 from tipl.forecaster import Forecaster, check_request
 from tipl.horizons import rows_of
@@ -16,7 +15,7 @@ from tipl.models.gate.forecaster import Gate, GateModelConfig
 from tipl.models.gate.network import GateConfig
 from tipl.registry import load_folder
 from tipl.runs import weights_of
-from tipl.saved import ARRAYS, ModelConfig, broken, load_network, read_config, write
+from tipl.saved import ModelConfig, arrays_of, broken, load_network, read_config, write
 from weighttraj import ParamLayout, Run
 
 
@@ -60,8 +59,8 @@ class StretchedGate(Forecaster):
     def save(self, path: str | Path) -> None:
         """Write config.json and model.safetensors."""
         amplitudes = {str(h): a for h, a in self.amplitudes.items()}
-        write(path, {**self.gate.document(), "kind": self.kind, "amplitudes": amplitudes})
-        save_file(self.gate.network.state_dict(), Path(path) / ARRAYS)
+        config = {**self.gate.document(), "kind": self.kind, "amplitudes": amplitudes}
+        write(path, config, arrays_of(self.gate.network))
 
     @classmethod
     def load(cls, path: str | Path) -> StretchedGate:
