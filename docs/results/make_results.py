@@ -66,6 +66,19 @@ OUT = Path("data/results")
 STRETCHED = ("last-iteration", "ema-0.9", "tipl-gate", "trend-20", "ar-20-phase", "relex-50")
 """Forecasts that are stretched by what the returns of validation runs say, all with one grid."""
 AMPLITUDES = "0.125 0.25 0.5 1 2 4"
+ABOUT = {
+    "NAME-stretched": "The forecast NAME, its displacement multiplied at each horizon by the "
+    "factor with the highest gain on validation runs.",
+    "gate-elsewhere": "tipl-gate trained on the six other tasks.",
+    "gate-timed": "tipl-gate that also reads the number of the snapshot.",
+    **{
+        name: f"Line {i} of the ablation: {text.replace('+', 'the line before, changed:', 1)}."
+        for i, (name, text) in enumerate(VARIANTS.items(), 1)
+    },
+    "tipl-gate": "One small network for all parameters, trained on all seven tasks.",
+    "Others": "Baselines, which the page “Train” describes.",
+}
+"""What the leaderboard says of its forecasters."""
 PUBLISHED, PAPER_DATA = "tipl-inverted-pendulum-v4", "inverted-pendulum-v4-ppo-v1"
 
 
@@ -330,7 +343,7 @@ def main() -> None:
     rows = read()
     for name, figure in figures(rows).items():
         (HERE / name).write_text(svg(figure))
-    write_page(leaderboard(rows, rival=RIVAL), HERE)
+    write_page(leaderboard(rows, rival=RIVAL), HERE, ABOUT)
     for path in (PAGE, README):
         path.write_text(insert(path.read_text()))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jinja2
@@ -26,15 +26,21 @@ def cells(entry: Entry, *, interval: bool = True) -> tuple[str, ...]:
     return (str(entry.tasks), *(_text(figure, interval) for figure in figures), cost)
 
 
-def write_page(board: Leaderboard, out: Path) -> Path:
-    """Write ``leaderboard.html``, ``leaderboard.md`` and ``leaderboard.csv``; return the page."""
+def write_page(board: Leaderboard, out: Path, about: Mapping[str, str] | None = None) -> Path:
+    """Write ``leaderboard.html``, ``leaderboard.md`` and ``leaderboard.csv``; return the page.
+
+    Args:
+        board: what is compared.
+        out: folder.
+        about: what some forecasters are, by name, for ``leaderboard.html``.
+    """
     out.mkdir(parents=True, exist_ok=True)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("tipl"), autoescape=True, trim_blocks=True
     )
     groups = [(*key, [(e, cells(e)) for e in lines]) for key, lines in _groups(board)]
     page = environment.get_template("leaderboard.html").render(
-        board=board, groups=groups, columns=COLUMNS, tasks=_by_task(board)
+        board=board, groups=groups, columns=COLUMNS, tasks=_by_task(board), about=about or {}
     )
     replace_file(out / "leaderboard.html", page.encode())
     replace_file(out / "leaderboard.md", markdown(board).encode())
