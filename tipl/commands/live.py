@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
 from tipl.live.results import LiveResults, read_live
 from tipl.live.study import LiveConfig, run_live
-from tipl.report.live import COLUMNS, cells, insert_live, rows_of, write_figures
+from tipl.report.live import arm_label, cells, insert_live, rows_of, shares_of, write_figures
 from weighttraj.remote.address import here, new_path
 from weighttraj.terminal import Output, say
 
@@ -57,11 +58,19 @@ def live_report(results: Path, into: Path | None) -> None:
 
 
 def _table(results: LiveResults, task: str) -> Table:
-    table = Table(title=f"{task}, {results.stage} seeds, against {results.baseline}")
-    table.add_column("arm", no_wrap=True)
-    for column in COLUMNS:
-        table.add_column(column, justify="right")
-    for arm in rows_of(results, task, results.baseline):
-        texts = cells(results, task, arm, results.baseline, interval=False)
-        table.add_row(escape(arm), *texts)
+    against = results.baseline
+    table = Table(
+        title=f"{task}, {results.stage} seeds, against {against}",
+        caption=f"Ratios of environment steps to shares of {against}'s final return, differences "
+        "of returns, and CPU time of the forecasts. results.json has intervals.",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("arm")
+    heads = [f"{share} %" for share in shares_of(results)]
+    for head in (*heads, "final", "area", "worst", "CPU"):
+        table.add_column(head, justify="right", no_wrap=True)
+    for arm in rows_of(results, task, against):
+        texts = cells(results, task, arm, against, short=True)
+        table.add_row(escape(arm_label(results, task, arm)), *texts)
     return table

@@ -20,8 +20,8 @@ from tipl.report.markdown import places, rewrite
 from weighttraj.atomic import replace_file
 from weighttraj.text import markdown as escaped
 
-COLUMNS = ("steps to 50 %", "75 %", "90 %", "95 %", "final", "area", "worst decile", "forecasts")
-"""Columns of a table behind the arm, where the plan has these thresholds."""
+DIFFERENCES = ("final", "area", "worst decile")
+"""Figures that are differences of returns, in the order of the columns."""
 _COLOURS = ("#c0392b", "#2471a3", "#17a589", "#8e44ad", "#e67e22", "#7d6608", "#d6529e", "#5dade2")
 _WHAT = "live"
 
@@ -107,17 +107,31 @@ def rows_of(results: LiveResults, task: str, against: str) -> list[str]:
     return list(dict.fromkeys(mine))
 
 
+def shares_of(results: LiveResults) -> list[str]:
+    """Return the thresholds of a study, in per cent of the baseline's final return."""
+    return [f"{100 * share:g}" for share in results.plan["thresholds"]]
+
+
 def cells(
-    results: LiveResults, task: str, arm: str, against: str, *, interval: bool = True
+    results: LiveResults, task: str, arm: str, against: str, *, short: bool = False
 ) -> list[str]:
-    """Return the texts of an arm's columns."""
+    """Return an arm's figures as texts: a ratio for each threshold, differences, CPU time.
+
+    Args:
+        results: of one stage of a study.
+        task: one of its tasks.
+        arm: one of its arms.
+        against: the arm that it is compared with.
+        short: without intervals, and without the numbers of trainings that never arrive.
+    """
     found = {
         figure.name: figure
         for figure in results.figures
         if (figure.task, figure.arm, figure.against) == (task, arm, against)
     }
-    names = [*(f"steps to {share} %" for share in ("50", "75", "90", "95")), *COLUMNS[4:7]]
-    texts = [_text(found.get(name), interval) for name in names]
+    names = [*(f"steps to {share} %" for share in shares_of(results)), *DIFFERENCES]
+    told = _number if short else _text
+    texts = [told(found.get(name), interval=not short) for name in names]
     cpu = chosen(results, task, arm).cpu
     return [*texts, f"{100 * cpu.forecasts / cpu.training:.1f} %"]
 
@@ -151,9 +165,15 @@ def write_figures(results: LiveResults, folder: Path) -> None:
             replace_file(folder / f"{task}{suffix}.svg", svg(figure).encode())
 
 
-def summary(results: LiveResults, threshold: str = "90") -> str:
+def _main_share(results: LiveResults) -> str:
+    """Return the threshold of short tables: 90 %, or the plan's last one."""
+    shares = shares_of(results)
+    return "90" if "90" in shares else shares[-1]
+
+
+def summary(results: LiveResults) -> str:
     """Return a table of the arms that were best on the tuning seeds, a task a line."""
-    others = _others(results)
+    others, threshold = _others(results), _main_share(results)
     lines = [
         f"| task | tuned forecast | steps to {threshold} %, against "
         f"{' | against '.join(map(escaped, others))} | final return |",
@@ -260,9 +280,9 @@ def _others(results: LiveResults) -> list[str]:
     return [arm for arm in dict.fromkeys((results.baseline, results.rival)) if arm]
 
 
-def _short(results: LiveResults, task: str, threshold: str = "90") -> str:
+def _short(results: LiveResults, task: str) -> str:
     """Return a table of the most important figures: an arm a line, the primary one in bold."""
-    others, name = _others(results), f"steps to {threshold} %"
+    others, name = _others(results), f"steps to {_main_share(results)} %"
     count = len(chosen(results, task, results.baseline).curves)
     found = {(f.arm, f.against, f.name): f for f in results.figures if f.task == task}
     lines = [
@@ -284,12 +304,14 @@ def _short(results: LiveResults, task: str, threshold: str = "90") -> str:
 def _markdown(results: LiveResults, task: str, against: str) -> str:
     """Return one table: an arm a line, compared with another arm."""
     baseline = chosen(results, task, results.baseline)
+    first, *others = (f"{share} %" for share in shares_of(results))
+    columns = [f"steps to {first}", *others, *DIFFERENCES, "forecasts"]
     lines = [
         f"**{escaped(task)}, {len(baseline.curves)} {results.stage} seeds, against "
         f"{escaped(arm_label(results, task, against))}**",
         "",
-        f"| arm | {' | '.join(COLUMNS)} |",
-        f"|---|{'---:|' * len(COLUMNS)}",
+        f"| arm | {' | '.join(columns)} |",
+        f"|---|{'---:|' * len(columns)}",
     ]
     for arm in rows_of(results, task, against):
         texts = cells(results, task, arm, against)
@@ -305,13 +327,19 @@ def _text(figure: Figure | None, interval: bool) -> str:
     return text
 
 
+def _ratio(value: float) -> str:
+    """Return a ratio with two decimals, or three where two would hide on which side of 1 it is."""
+    text = f"{value:.2f}"
+    return f"{value:.3f}" if text == "1.00" and abs(value - 1) >= 0.0005 else text
+
+
 def _number(figure: Figure | None, interval: bool) -> str:
     """Return a ratio of steps, or a difference of returns in per cent, with its interval."""
     if figure is None or figure.value is None:
         return "-"
     numbers: Sequence[float | None] = (figure.value, figure.low, figure.high)
     if figure.name.startswith("steps"):
-        told = [f"{x:.2f}" for x in numbers if x is not None]
+        told = [_ratio(x) for x in numbers if x is not None]
     else:
         told = [f"{100 * x:+.0f} %" for x in numbers if x is not None]
     text = told[0]
