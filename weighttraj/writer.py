@@ -309,6 +309,7 @@ _MAY_DIFFER = (
     "profile",
     "block",  # moves no value, and large snapshots have a smaller one
     "evaluation",  # snapshots that are appended have no returns yet
+    "moved_by",  # known once something has moved the weights
 )
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -43,6 +44,7 @@ from weighttraj.collect.agents import find_agent
 from weighttraj.collect.describe import describe_run
 from weighttraj.collect.normalizers import find_normalizers
 from weighttraj.collect.population import Population, origins_of
+from weighttraj.collect.ppo import make_ppo
 from weighttraj.collect.settings import Store
 from weighttraj.tools.lint import lint_run
 
@@ -300,6 +302,24 @@ def test_a_training_that_is_stopped_leaves_its_jumps(tmp_path: Path) -> None:
     run = wt.open_run(tmp_path / "run.zarr")
     assert (run.info.status, run.info.moved_by) == ("crashed", ("Stop",))
     assert "moved" in [finding.check for finding in lint_run(run)]
+    again = WeightTrajectoryCallback(tmp_path / "run.zarr", every=EVERY, resume=True)
+    learn(SMALL, [ForecastCallback(Ahead(), OUTER), again])
+    assert wt.open_run(tmp_path / "run.zarr").info.status == "complete"
+
+
+def test_jumps_that_are_refused_leave_an_ordinary_run(tmp_path: Path) -> None:
+    recorder = WeightTrajectoryCallback(tmp_path / "run.zarr", every=EVERY)
+    callback = ForecastCallback(Ahead(3.0), replace(OUTER, guard="batch"))
+    learn(SMALL, [callback, recorder])
+    assert {jump.outcome for jump in callback.jumps} == {"refused"}
+    assert wt.open_run(tmp_path / "run.zarr").info.moved_by == ()
+
+
+def test_a_callback_that_refuses_the_training_leaves_no_run(tmp_path: Path) -> None:
+    recorder = WeightTrajectoryCallback(tmp_path / "run.zarr", every=EVERY)
+    with pytest.raises(ForecastError, match="at least 64"):
+        learn(SMALL, [recorder, ForecastCallback("tipl-gate")])
+    assert not (tmp_path / "run.zarr").exists()
 
 
 def test_a_log_that_cannot_be_written_is_told_before_the_training(tmp_path: Path) -> None:
@@ -357,7 +377,7 @@ def test_horizons_follow_the_schedule() -> None:
     [
         *({"horizon": 0}, {"period": 0}, {"schedule": ()}, {"schedule": ((1, 0),)}),
         *({"guard": "bacth"}, {"moments": "rest"}, {"schedule": "faling"}, {"every": 2.5}),
-        *({"amplitude": float("nan")}, {"first": 3, "last": 2}, {"horizon": "50"}),
+        *({"amplitude": np.float64("nan")}, {"first": 3, "last": 2}, {"horizon": "50"}),
     ],
 )
 def test_impossible_settings_of_jumps_are_refused(wrong: dict[str, Any]) -> None:
@@ -665,6 +685,40 @@ def test_the_rollout_guard_needs_the_returns_of_episodes() -> None:
     PPO("MlpPolicy", env, **settings).learn(128, callback=ForecastCallback("last-step", OUTER))
 
 
+def test_episodes_that_a_wrapper_ends_are_no_reason_to_refuse() -> None:
+    class Half(gym.Wrapper[Any, Any, Any, Any]):
+        """Ends an episode outside the Monitor, as Atari's wrapper does when a life is lost."""
+
+        steps = 0
+
+        def step(self, action: Any) -> Any:
+            self.steps += 1
+            seen, reward, done, late, info = self.env.step(action)
+            return seen, reward, done or self.steps % 3 == 0, late, info
+
+    env = make_vec_env("InvertedPendulum-v4", wrapper_class=Half)
+    settings: Any = {"n_steps": 64, "batch_size": 16, "n_epochs": 2, "device": "cpu"}
+    callback = ForecastCallback("last-iteration", replace(OUTER, guard="rollout"))
+    PPO("MlpPolicy", env, **settings).learn(128, callback=callback)
+    assert len(callback.jumps) == 1
+
+
+def test_a_training_that_failed_is_continued_with_a_new_iteration() -> None:
+    class Fails(ForecastCallback):
+        def _on_gradient_step(self, *details: object) -> None:
+            super()._on_gradient_step(*details)
+            if self._iteration == 2 and len(cast(Any, self._path)._run) == 7:
+                raise KeyboardInterrupt
+
+    callback = Fails(Ahead(0.001), replace(OUTER, guard="rollout", episodes=2))
+    model = make_ppo(SMALL, seed=3)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(256, callback=callback)
+    model.learn(64, callback=callback, reset_num_timesteps=False)
+    path = cast(Any, callback._path)
+    assert path._run.phase.tolist() == [-1, 0, 1, 2, 3, 0, 1, 0, 1, 2, 3]
+
+
 def test_horizons_and_cadence_of_a_stretched_forecaster_are_its_own() -> None:
     for name in ("ar-20-phase", "tipl-gate", "tipl-causal"):
         along = tipl.load(f"{name}-inverted-pendulum-v4")
@@ -694,12 +748,18 @@ def test_trainings_with_another_forecaster_are_made_again(
     plan.write_text(
         PLAN.replace('"last-iteration"\njump = { horizon = 50', '"m"\njump = { horizon = 50')
     )
-    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning", arms=("far",))
+    config = LiveConfig(plan=plan, out=plan.parent / "out", stage="tuning")
     for decay in (0.9, 0.95):
         tipl.load(f"ema-{decay}").save("m")
+        if decay == 0.95:  # trainings with the old model count no more, whatever is asked for
+            assert [x.arm for x in run_live(replace(config, arms=("ppo",))).series] == [
+                *("ppo", "outer", "outer"),
+            ]
         run_live(config)
         made = json.loads((config.out / "tuning/pendulum/far/10-11.json").read_bytes())
         assert made["fingerprint"] == fingerprint(tipl.load("m"))
+    shutil.rmtree("m")
+    assert len(run_live(config).series) == 4  # all is there: no forecaster is needed
 
 
 def test_a_damaged_file_of_trainings_is_refused(plan: Path) -> None:

@@ -102,7 +102,7 @@ def read_block(block: Block) -> Made | None:
             expected="what `tipl live` wrote",
             got=error,
             where=block.file,
-            do="restore it from a copy, or delete it: the same command then trains them again",
+            do="restore it from a copy; or delete it, and run this arm of this stage again",
         ) from error
     wanted = msgspec.json.decode(msgspec.json.encode(block.source))
     if made.fingerprint and block.fingerprint not in ("", made.fingerprint):

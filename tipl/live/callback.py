@@ -17,7 +17,14 @@ from jaxtyping import Float32
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.distributions import kl_divergence
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecNormalize,
+)
 
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster
@@ -122,10 +129,13 @@ class ForecastCallback(BaseCallback):
         if self._path is None:  # a second call of learn continues the same path
             layout = describe_layout(self._agent.actor, describe_agent(self._agent, ()))
             self._path = TrainingPath(self._forecaster, self.config, layout, self._weights())
+        self._path.end_iteration(self._weights())
+        self._before, self._fallen, self._returns = None, False, []
         samples = self.model.n_steps * self.model.n_envs
         self._path.check_iteration(self.model.n_epochs * -(-samples // self.model.batch_size))
         if self.config.guard == "rollout":
             self._check_normalizers()
+        self._has_monitor = _has_monitor(self.model.get_env())
         if self._log is not None:
             self._write_jumps()
         if self._hook is not None:  # an exception ended the call of learn() before
@@ -135,10 +145,11 @@ class ForecastCallback(BaseCallback):
         self._trained = False
 
     def _on_step(self) -> bool:
-        for info, done in zip(self.locals["infos"], self.locals["dones"], strict=True):
+        infos = self.locals.get("infos", ())
+        for info, done in zip(infos, self.locals.get("dones", [False] * len(infos)), strict=True):
             if (episode := info.get("episode")) is not None:
                 self._returns.append(float(np.asarray(episode["r"]).item()))
-            elif done and self.config.guard == "rollout":
+            elif done and self.config.guard == "rollout" and not self._has_monitor:
                 raise ForecastError(
                     "an episode ended and nothing told its return, which the guard needs",
                     expected="an environment in Stable-Baselines3's Monitor or VecMonitor",
@@ -324,7 +335,6 @@ class ForecastCallback(BaseCallback):
         if self._before is not None and self._fallen:
             self._undo(self._weights(), self._before)
         self._before = None
-        cast(TrainingPath, self._path).end_iteration(self._weights())
         self._write_jumps()
 
     def _write_jumps(self) -> None:
@@ -350,6 +360,18 @@ def _recorders(callback: Any) -> list[WeightTrajectoryCallback]:
     if isinstance(callback, CallbackList):
         return [found for one in callback.callbacks for found in _recorders(one)]
     return [callback] if isinstance(callback, WeightTrajectoryCallback) else []
+
+
+def _has_monitor(env: Any) -> bool:
+    """Say whether something around an environment reports the returns of episodes."""
+    kinds: Any = (Monitor, gym.wrappers.RecordEpisodeStatistics)
+    if any(any(env.env_is_wrapped(kind)) for kind in kinds):
+        return True
+    while isinstance(env, VecEnvWrapper):
+        if isinstance(env, VecMonitor):
+            return True
+        env = env.venv
+    return False
 
 
 def _kept(rows: Any) -> Any:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_type_hints
 
 import msgspec
+import numpy as np
 
 from tipl.errors import ForecastError
 from tipl.forecaster import Forecaster
@@ -59,7 +60,8 @@ class JumpConfig:
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(JumpConfig).items():
             try:
-                msgspec.convert(value := getattr(self, name), kind)
+                value = getattr(self, name)
+                msgspec.convert(value.item() if isinstance(value, np.generic) else value, kind)
             except msgspec.ValidationError as error:
                 raise ForecastError(
                     "invalid settings of a jump",

@@ -219,8 +219,12 @@ def _check_arm(plan: Plan, name: str, arm: Arm) -> None:
 
 
 def _check_name(what: str, name: str) -> None:
-    if re.fullmatch(r"\w[\w.-]*", name) is None:  # it names a folder
-        raise ValueError(f"{what} {name!r}: a name has letters, digits, '_', '-' and '.' only")
+    # It names a folder beside the files of results.
+    if re.fullmatch(r"\w[\w.-]*", name) is None or name.endswith((".json", ".csv", ".svg")):
+        raise ValueError(
+            f"{what} {name!r}: a name has letters, digits, '_', '-' and '.' only, and does not end "
+            "like a file"
+        )
 
 
 def _check_seeds(tuning: Sequence[int], test: Sequence[int]) -> None:

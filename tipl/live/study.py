@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -71,18 +72,17 @@ def run_live(
     _check_names(plan, config)
     for task in config.tasks or plan.tasks:
         check_task(plan, task, config.plan.parent)
-    tuned = None
+    marks, tuned = _Marks(), None
     if config.stage == "test":
         whole = replace(config, stage="tuning", tasks=(), arms=())
-        tuned = _Ranked.of(plan, _series(plan, whole))
-    blocks = _marked(_blocks(plan, config, tuned))
-    _make([block for block in blocks if read_block(block) is None], config, console)
-    folder, series = config.out / config.stage, _series(plan, config, tuned)
+        tuned = _Ranked.of(plan, _series(plan, whole, marks))
+    _make(list(_missing(_blocks(plan, config, tuned), marks)), config, console)
+    folder, series = config.out / config.stage, _series(plan, config, marks, tuned)
     while True:
         results = _results(plan, config, series, tuned, command)
         write_document(folder / RESULTS, results)
         replace_file(folder / "curves.csv", _csv(series).encode())
-        before, series = series, _series(plan, config, tuned)
+        before, series = series, _series(plan, config, marks, tuned)
         if series == before:  # no other command has finished a training in the meantime
             return results
 
@@ -155,18 +155,39 @@ def _blocks(plan: Plan, config: LiveConfig, tuned: _Ranked | None) -> Iterator[B
                 )
 
 
-def _marked(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Yield blocks with the fingerprints of their forecasters, each of which is loaded once."""
-    marks: dict[str, str] = {"": ""}
-    for block in blocks:
+class _Marks:
+    """Fingerprints of forecasters, each of which is loaded once."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, str] = {"": ""}
+
+    def on(self, block: Block) -> Block:
+        """Return a block with the fingerprint of its forecaster.
+
+        Raises:
+            Exception: the forecaster cannot be loaded.
+        """
         name = block.trial.forecaster
-        if name not in marks:
+        if name not in self._found:
             try:
-                marks[name] = fingerprint(forecaster_of(name))
+                self._found[name] = fingerprint(forecaster_of(name))
             except Exception as error:
                 error.add_note(f"arm {block.trial.arm!r}, task {block.task!r}")
                 raise
-        yield msgspec.structs.replace(block, fingerprint=marks[name])
+        return msgspec.structs.replace(block, fingerprint=self._found[name])
+
+    def read(self, block: Block) -> Made | None:
+        """Return a block's trainings, of any forecaster if its own cannot be loaded here."""
+        with contextlib.suppress(WeightTrajError, OSError, ImportError):
+            block = self.on(block)
+        return read_block(block)
+
+
+def _missing(blocks: Iterable[Block], marks: _Marks) -> Iterator[Block]:
+    """Yield the blocks that are still to be trained."""
+    for block in blocks:
+        if marks.read(block) is None:
+            yield marks.on(block)
 
 
 def _trials(plan: Plan, config: LiveConfig, task: str, tuned: _Ranked | None) -> Iterator[Trial]:
@@ -219,7 +240,9 @@ def _make(blocks: Sequence[Block], config: LiveConfig, console: Console | None) 
                 wait_for(blocks[0])
 
 
-def _series(plan: Plan, config: LiveConfig, tuned: _Ranked | None = None) -> list[Series]:
+def _series(
+    plan: Plan, config: LiveConfig, marks: _Marks, tuned: _Ranked | None = None
+) -> list[Series]:
     """Return the trainings of each trial on each task, of the arms whose trainings are all there.
 
     A task is left out where those of the baseline are not.
@@ -228,22 +251,23 @@ def _series(plan: Plan, config: LiveConfig, tuned: _Ranked | None = None) -> lis
     for task in plan.tasks:
         made: dict[str, list[Series]] = {}
         for arm in plan.arms:
-            if found := _finished(plan, replace(config, tasks=(task,), arms=(arm,)), arm, tuned):
+            if found := _finished(plan, replace(config, tasks=(task,), arms=(arm,)), marks, tuned):
                 made[arm] = found
         if plan.baseline in made:
             series += [one for found in made.values() for one in found]
     return series
 
 
-def _finished(plan: Plan, config: LiveConfig, arm: str, tuned: _Ranked | None) -> list[Series]:
-    """Return the trainings of each trial of an arm on a task; empty: some are missing."""
+def _finished(plan: Plan, config: LiveConfig, marks: _Marks, tuned: _Ranked | None) -> list[Series]:
+    """Return the trainings of each trial of one arm on one task; empty: some are missing."""
+    (arm,) = config.arms
     pairs: dict[str, list[tuple[Block, Made]]] = {}
     try:
         blocks = [block for block in _blocks(plan, config, tuned) if block.trial.arm == arm]
     except (WeightTrajError, OSError):  # not tuned, or a recipe of another task cannot be read
         return []
     for block in blocks:
-        if (made := read_block(block)) is None:
+        if (made := marks.read(block)) is None:
             return []
         pairs.setdefault(block.trial.name, []).append((block, made))
     return [_joined(some) for some in pairs.values()]

@@ -158,11 +158,12 @@ class WeightTrajectoryCallback(BaseCallback):
         if self._recorder is None:  # this callback's turn comes after the other's
             yield
             return
-        self.writer.note_move(by)
         self._end_update()
         try:
             yield
         finally:
+            if self._watch.has_moved():
+                self.writer.note_move(by)
             self._watch.note()
 
     def __enter__(self) -> WeightTrajectoryCallback:
@@ -237,13 +238,19 @@ class WeightTrajectoryCallback(BaseCallback):
 
     def _hold_on(self) -> None:
         """Follow the optimizer's steps, and notice when an exception ends the training."""
-        self._undo = [Guard(self.model, self.close, self.locals.get("callback")).remove]
+        callback = self.locals.get("callback")
+        self._undo = [Guard(self.model, self.close, callback, self._abandon).remove]
         optimizer = self._agent.optimizer
         if optimizer is not None:
             self._undo += [
                 optimizer.register_step_pre_hook(self._on_step_begin).remove,
                 optimizer.register_step_post_hook(self._on_gradient_step).remove,
             ]
+
+    def _abandon(self) -> None:
+        """Leave no run: the training does not begin."""
+        self._let_go()
+        self._recording.discard()
 
     def _let_go(self) -> None:
         for undo in self._undo:

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 _METHODS = ("collect_rollouts", "train", "dump_logs", "_do_one_update")
 """What ``learn`` calls again and again, in one algorithm or another."""
-_LAST = "on_training_end"
-"""What it calls last of its callback."""
+_FIRST, _LAST = "on_training_start", "on_training_end"
+"""What it calls of its callbacks first and last."""
 _EXCLUDED = "_excluded_save_params"
 
 
@@ -25,14 +25,17 @@ class Guard:
     Args:
         model: whose training.
         on_exception: what to do. An error that it raises is noted on the exception.
-        callback: all that ``learn`` calls back, whose end of the training is watched too.
+        callback: what ``learn`` calls back. The end of the training is watched too, and its
+            beginning for those in a list that have not been told of it yet.
+        on_refusal: what to do if one of these refuses the training.
     """
 
     def __init__(
         self,
         model: BaseAlgorithm,
         on_exception: Callable[[], None],
-        callback: BaseCallback | None = None,
+        callback: BaseCallback | None,
+        on_refusal: Callable[[], None],
     ) -> None:
         self._wrappers: list[_Wrapper] = []
         names = [name for name in _METHODS if hasattr(model, name)]
@@ -41,6 +44,8 @@ class Guard:
         self._wrappers.append(_Exclusion(model, [*names, _EXCLUDED]))
         if callback is not None:
             self._wrappers.append(_Guarded(callback, _LAST, on_exception))
+        if isinstance(callback, CallbackList):
+            self._wrappers += [_Guarded(x, _FIRST, on_refusal) for x in callback.callbacks]
 
     def remove(self) -> None:
         """Give the model its own methods back. A second call does nothing."""
