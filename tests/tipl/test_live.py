@@ -581,9 +581,7 @@ def test_a_study_tunes_tests_and_goes_on_where_it_stopped(
     run_command("tipl report out/test/results.json --into page.md")
     assert page.read_text().count("\n| ") == 2 + 3 + 2 * 3  # summary, overview, tables
     assert "| **far** | " in page.read_text()  # the best forecast of the tuning
-    (line,) = (
-        row for row in page.read_text().splitlines() if "| pendulum, 3 test seeds | far |" in row
-    )
+    (line,) = (row for row in page.read_text().splitlines() if "| pendulum (3) | far |" in row)
     figures = {f.against: f.value for f in results.figures if (f.arm, f.name) == ("far", "final")}
     assert line.split(" | ")[-1].startswith(f"{100 * figures['ppo']:+.0f} %")  # the final return
     assert "| outer (amplitude " in page.read_text()

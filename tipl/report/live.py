@@ -42,7 +42,7 @@ def insert_live(results: LiveResults, source: Path, page: Path) -> None:
         old, _WHAT, source.as_posix(), lambda section: render(results, source, folder, section)
     )
     mine = [place.section for place in places(new) if place.source == source.as_posix()]
-    if {*mine} - {"summary", "tables"}:
+    if {*mine} - {"summary"} - ({"tables"} if results.stage == "tuning" else set()):
         write_figures(results, source.parent)
     replace_file(page.resolve(), new.encode())
 
@@ -55,17 +55,21 @@ def render(results: LiveResults, source: Path, folder: str, section: str) -> str
         source: their file, for messages.
         folder: the figures' folder, as the page links to it.
         section: a task with underscores, ``overview`` for all, ``summary`` for a line each, or
-            ``tables`` for every figure.
+            ``tables`` for every figure, and the learning curves of the test seeds.
     """
     if section == "summary":
         return summary(results)
     if section == "tables":
-        return "\n\n".join(
-            _markdown(results, task, against)
-            for task in results.thresholds
-            for against in _others(results)
-            if rows_of(results, task, against)
-        )
+        parts = []
+        for task in results.thresholds:
+            if results.stage == "test":
+                parts.append(f"![Learning curves of {task}]({folder}/{task}.svg)")
+            parts += [
+                _markdown(results, task, against)
+                for against in _others(results)
+                if rows_of(results, task, against)
+            ]
+        return "\n\n".join(parts)
     wanted = [
         task
         for task in results.thresholds
@@ -175,21 +179,20 @@ def summary(results: LiveResults) -> str:
     """Return a table of the arms that were best on the tuning seeds, a task a line."""
     others, threshold = _others(results), _main_share(results)
     lines = [
-        f"| task | tuned forecast | steps to {threshold} %, against "
+        f"| task ({results.stage} seeds) | tuned forecast | steps to {threshold} %, against "
         f"{' | against '.join(map(escaped, others))} | final return |",
         f"|---|---|{'---:|' * (len(others) + 1)}",
     ]
     for task in results.thresholds:
         arm = results.primary.get(task)
-        name = escaped(arm_label(results, task, arm)) if arm else "-"
+        name = escaped(arm) if arm else "-"
         found = _primary_figures(results, task, f"steps to {threshold} %")
         final = _primary_figures(results, task, "final")
         # How many trainings never arrive is in the long tables, which explain it.
         texts = [_number(found.get(against), interval=True) for against in others]
         texts.append(_number(final.get(others[0]), interval=True))
         count = len(chosen(results, task, results.baseline).curves)
-        begun = f"{escaped(task)}, {count} {results.stage} seeds"
-        lines.append(f"| {begun} | {name} | {' | '.join(texts)} |")
+        lines.append(f"| {escaped(task)} ({count}) | {name} | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 
