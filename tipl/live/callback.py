@@ -96,6 +96,7 @@ class ForecastCallback(BaseCallback):
         self._fallen = False
         self._path: TrainingPath | None = None
         self._followed: PPO | None = None
+        self._has_monitor = False
         self._batch: dict[str, Any] = {}
         self._hook: Any = None
         self._agent: Agent
@@ -135,7 +136,7 @@ class ForecastCallback(BaseCallback):
         self._path.check_iteration(self.model.n_epochs * -(-samples // self.model.batch_size))
         if self.config.guard == "rollout":
             self._check_normalizers()
-        self._has_monitor = _has_monitor(self.model.get_env())
+            self._has_monitor = _has_monitor(self.model.get_env())
         if self._log is not None:
             self._write_jumps()
         if self._hook is not None:  # an exception ended the call of learn() before
