@@ -439,7 +439,7 @@ def _rows(key: Any, n: int, where: str) -> Any:
                 expected="a step of at least 1",
                 got=f"step {step}",
                 where=where,
-                do="read forward, and turn the array round",
+                do="read forward, and reverse the array",
             )
         return slice(start, max(start, stop), step)
     index = np.asarray(key)

@@ -21,9 +21,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecEnv,
-    VecEnvWrapper,
     VecMonitor,
     VecNormalize,
+    is_vecenv_wrapped,
 )
 
 from tipl.errors import ForecastError
@@ -136,7 +136,7 @@ class ForecastCallback(BaseCallback):
         self._path.check_iteration(self.model.n_epochs * -(-samples // self.model.batch_size))
         if self.config.guard == "rollout":
             self._check_normalizers()
-            self._has_monitor = _has_monitor(self.model.get_env())
+            self._has_monitor = _has_monitor(cast(VecEnv, self.model.get_env()))
         if self._log is not None:
             self._write_jumps()
         if self._hook is not None:  # an exception ended the call of learn() before
@@ -152,7 +152,7 @@ class ForecastCallback(BaseCallback):
                 self._returns.append(float(np.asarray(episode["r"]).item()))
             elif done and self.config.guard == "rollout" and not self._has_monitor:
                 raise ForecastError(
-                    "an episode ended and nothing told its return, which the guard needs",
+                    "an episode ended without a reported return, which the guard 'rollout' needs",
                     expected="an environment in Stable-Baselines3's Monitor or VecMonitor",
                     got="an info without 'episode'",
                     do="wrap the environment in Monitor, or choose another guard",
@@ -198,10 +198,8 @@ class ForecastCallback(BaseCallback):
 
     def _check_normalizers(self) -> None:
         """Refuse normalisers that the guard ``rollout`` could not put back."""
-        env = cast(VecEnv, self.model.get_env())
+        env = cast(VecEnv, self.model.get_env()).unwrapped
         kinds = (gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward)
-        while isinstance(env, VecEnvWrapper):
-            env = env.venv
         if isinstance(env, DummyVecEnv):
             return
         found = [kind.__name__ for kind in kinds if any(env.env_is_wrapped(cast(Any, kind)))]
@@ -363,16 +361,11 @@ def _recorders(callback: Any) -> list[WeightTrajectoryCallback]:
     return [callback] if isinstance(callback, WeightTrajectoryCallback) else []
 
 
-def _has_monitor(env: Any) -> bool:
+def _has_monitor(env: VecEnv) -> bool:
     """Say whether something around an environment reports the returns of episodes."""
     kinds: Any = (Monitor, gym.wrappers.RecordEpisodeStatistics)
-    if any(any(env.env_is_wrapped(kind)) for kind in kinds):
-        return True
-    while isinstance(env, VecEnvWrapper):
-        if isinstance(env, VecMonitor):
-            return True
-        env = env.venv
-    return False
+    inside = any(any(env.env_is_wrapped(kind)) for kind in kinds)
+    return inside or is_vecenv_wrapped(env, VecMonitor)
 
 
 def _kept(rows: Any) -> Any:

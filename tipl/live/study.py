@@ -91,6 +91,8 @@ def run_live(
 class _Ranked:
     """What the trainings of a stage say of the trials."""
 
+    thresholds: dict[str, dict[str, float]]
+    """Return of each threshold, by task and share in per cent."""
     best: dict[str, dict[str, str]]
     """Best trial of each arm, by task and arm."""
     scores: dict[str, dict[str, float]]
@@ -98,11 +100,11 @@ class _Ranked:
 
     @classmethod
     def of(cls, plan: Plan, series: Sequence[Series]) -> _Ranked:
-        found = cls({}, {})
+        found = cls({}, {}, {})
         for task in dict.fromkeys(one.task for one in series):
             mine = [one for one in series if one.task == task]
             (baseline,) = (one for one in mine if one.arm == plan.baseline)
-            limits = thresholds_of(plan, baseline)
+            limits = found.thresholds[task] = thresholds_of(plan, baseline)
             score = found.scores[task] = {
                 one.trial: math.exp(mean_log_ratio(plan, one, baseline, limits)) for one in mine
             }
@@ -291,21 +293,18 @@ def _joined(pairs: Sequence[tuple[Block, Made]]) -> Series:
 def _results(
     plan: Plan, config: LiveConfig, series: Sequence[Series], tuned: _Ranked | None, command: str
 ) -> LiveResults:
-    thresholds: dict[str, dict[str, float]] = {}
     finals: dict[str, dict[str, float]] = {}
     ranked = _Ranked.of(plan, series)
     figures: list[Figure] = []
     for task in dict.fromkeys(one.task for one in series):
         mine = [one for one in series if one.task == task]
-        (baseline,) = (one for one in mine if one.arm == plan.baseline)
-        limits = thresholds[task] = thresholds_of(plan, baseline)
         finals[task] = {one.trial: final(one, plan.evaluation_of(task)) for one in mine}
         chosen = [one for one in mine if ranked.best[task][one.arm] == one.trial]
         rivals = [one for one in chosen if one.arm in (plan.baseline, plan.rival)]
         for other in rivals:
             for one in chosen:
                 if one.arm != other.arm:
-                    figures += compare(plan, one, other, limits)
+                    figures += compare(plan, one, other, ranked.thresholds[task])
     builtins: dict[str, Any] = msgspec.to_builtins(plan)
     return LiveResults(
         study=plan.id,
@@ -313,7 +312,7 @@ def _results(
         baseline=plan.baseline,
         rival=plan.rival,
         plan=builtins,
-        thresholds=thresholds,
+        thresholds=ranked.thresholds,
         final=finals,
         best=ranked.best,
         scores=ranked.scores,

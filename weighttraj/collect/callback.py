@@ -110,7 +110,7 @@ class WeightTrajectoryCallback(BaseCallback):
                 "snapshots need at least one gradient step between them",
                 expected="every at least 1",
                 got=every,
-                do="change every",
+                do="set every to at least 1",
             )
         self.path = Path(path)
         self.unit: Unit = "update" if unit == "update" else "gradient_step"
